@@ -1,0 +1,193 @@
+"""The command ``giril``: see the recipes, copy one, run one, evaluate a run.
+
+Exit codes: 0 done; 1 an error that is not the user's, with its traceback; 2 refused, in one
+sentence on standard error (``--traceback`` shows where); 130 interrupted. Torch, TorchRL and Hydra
+are imported only by the commands that need them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import traceback
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import NoReturn
+
+from giril_rl import recipes
+from giril_rl.errors import UserError
+from giril_rl.nearest import did_you_mean
+
+
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        raise UserError(f"{message}; see `{self.prog} --help`.")
+
+
+def _ls(argv: Sequence[str]) -> int:
+    """List the recipes."""
+    _Parser("giril ls", description=_ls.__doc__).parse_args(argv)
+    found = recipes.shipped()
+    width = max(len(recipe.name) for recipe in found)
+    for recipe in found:
+        print(f"{recipe.name:<{width}}  {recipe.docstring.partition(chr(10))[0]}")
+    return 0
+
+
+def _cp(argv: Sequence[str]) -> int:
+    """Copy a recipe and its settings, to change them."""
+    parser = _Parser("giril cp", description=_cp.__doc__)
+    parser.add_argument("recipe", metavar="RECIPE", help="a name that `giril ls` shows")
+    parser.add_argument("file", metavar="FILE", type=Path, help="where to, such as my_recipe.py")
+    args = parser.parse_args(argv)
+    file, settings = recipes.copy(recipes.find(args.recipe), args.file)
+    print(f"{file} and {settings} are yours: change them, then `giril run {file}`.")
+    return 0
+
+
+def _run(argv: Sequence[str]) -> int:
+    """Run a recipe; key=value changes a knob."""
+    parser = _Parser("giril run", description=_run.__doc__, add_help=False)
+    parser.add_argument(
+        "words",
+        nargs="*",
+        metavar="RECIPE [key=value ...]",
+        help="a name that `giril ls` shows or a copied file, then any of its knobs",
+    )
+    parser.add_argument(
+        "-m",
+        "--multirun",
+        action="store_true",
+        help="run every combination of values like seed=0,1",
+    )
+    parser.add_argument("-h", "--help", action="store_true", help="show the recipe's knobs")
+    args = parser.parse_intermixed_args(argv)
+    if not args.words:
+        if args.help:
+            parser.print_help()
+            return 0
+        raise UserError("name a recipe: `giril ls` shows them.")
+    recipe, texts = recipes.find(args.words[0]), args.words[1:]
+    from giril_rl.recipe_config import config_class
+
+    schema = config_class(recipe)
+    if args.help:
+        from giril_rl.cli_help import recipe_help
+
+        print(recipe_help(recipe, schema, texts))
+        return 0
+
+    from giril_rl.compose import resolved
+    from giril_rl.naming import out_folder
+    from giril_rl.overrides import sweep
+
+    jobs: dict[Path, list[str]] = {}
+    # All jobs are composed and checked first: a bad value in the last one stops the sweep at once.
+    for job in sweep(texts) if args.multirun else [texts]:
+        out = out_folder(recipe.name, *resolved(recipe, schema, job))
+        if out in jobs:
+            raise UserError(
+                f"two jobs would share the folder {out}: leave out= to giril, or vary it."
+            )
+        jobs[out] = job
+    module = recipe.load()
+
+    def run(out: Path) -> None:
+        module.main(resolved(recipe, module.Config, jobs[out])[0], out)
+
+    if args.multirun:
+        return _run_all(run, {out: " ".join([recipe.word, *job]) for out, job in jobs.items()})
+    for out in jobs:
+        run(out)
+    return 0
+
+
+def _run_all(run: Callable[[Path], None], titles: Mapping[Path, str]) -> int:
+    failed: dict[str, int] = {}
+    for number, (out, title) in enumerate(titles.items(), 1):
+        print(f"[{number}/{len(titles)}] {title}", flush=True)
+        try:
+            run(out)
+        except Exception as error:
+            failed[title] = _report(error, show_traceback=False)
+    if failed:
+        print(f"giril: {len(failed)} of {len(titles)} jobs failed:", file=sys.stderr)
+        for title in failed:
+            print(f"  {title}", file=sys.stderr)
+    return min(failed.values(), default=0)
+
+
+def _eval(argv: Sequence[str]) -> int:
+    """Score a run's policy on fresh environments."""
+    parser = _Parser("giril eval", description=_eval.__doc__)
+    parser.add_argument("run", metavar="RUN", type=Path, help="the folder of a run")
+    parser.add_argument("--episodes", type=int, metavar="N", help="whole episodes to play")
+    parser.add_argument("--seed", type=int, metavar="S", help="seed of the episodes")
+    args = parser.parse_args(argv)
+    if not args.run.is_dir():
+        raise UserError(f"there is no run folder {args.run}.")
+    if args.episodes is not None and args.episodes < 1:
+        raise UserError(f"--episodes {args.episodes}: at least 1 is needed.")
+    if args.seed is not None and args.seed < 0:
+        raise UserError(f"--seed {args.seed}: at least 0 is needed.")
+    from giril_rl.training.evaluate import evaluate_run
+
+    evaluate_run(args.run, args.episodes, args.seed)
+    return 0
+
+
+_COMMANDS: dict[str, tuple[Callable[[Sequence[str]], int], str]] = {
+    "ls": (_ls, "giril ls"),
+    "cp": (_cp, "giril cp RECIPE FILE"),
+    "run": (_run, "giril run RECIPE [key=value ...] [-m] [--help]"),
+    "eval": (_eval, "giril eval RUN [--episodes N] [--seed S]"),
+}
+
+
+def _usage() -> str:
+    width = max(len(usage) for _, usage in _COMMANDS.values())
+    rows = [f"  {usage:<{width}}  {command.__doc__}" for command, usage in _COMMANDS.values()]
+    last = "`giril COMMAND --help` says more; --traceback shows where a refusal came from."
+    return "\n".join(["Imitation learning with generated rewards.", "", *rows, "", last])
+
+
+def _report(error: Exception, show_traceback: bool) -> int:
+    refused = isinstance(error, UserError)
+    if show_traceback or not refused:
+        traceback.print_exception(error)
+    if refused:
+        print(f"giril: {error}", file=sys.stderr)
+    return 2 if refused else 1
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line and return its exit code.
+
+    Args:
+        argv: the words after ``giril``; None takes them from the process.
+
+    Examples:
+        >>> main(["ls"])
+        control ...
+        0
+    """
+    words = list(sys.argv[1:] if argv is None else argv)
+    show_traceback = "--traceback" in words
+    words = [word for word in words if word != "--traceback"]
+    try:
+        if not words or words[0] in ("-h", "--help"):
+            print(_usage())
+            return 0
+        if words[0] not in _COMMANDS:
+            hint = did_you_mean(words[0], _COMMANDS) or f": choose one of {', '.join(_COMMANDS)}."
+            raise UserError(f"{words[0]!r} is not a command{hint}")
+        return _COMMANDS[words[0]][0](words[1:])
+    except KeyboardInterrupt:
+        print("giril: interrupted.", file=sys.stderr)
+        return 130
+    except Exception as error:
+        return _report(error, show_traceback)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,174 @@
+"""From a recipe and ``key=value`` texts to the recipe's ``Config``, through Hydra's Compose API.
+
+The Compose API rather than ``@hydra.main``: the latter owns the process (it parses the command
+line, changes the exit codes and prints its own multi-line errors), and this command line promises
+refusals of one sentence, its own exit codes and several recipes behind one command. What is
+composed, the override grammar and the sweeps are Hydra's all the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, is_dataclass
+from typing import Any
+
+from hydra import compose as hydra_compose
+from hydra import initialize_config_dir
+from hydra.core.config_store import ConfigStore
+from hydra.errors import HydraException
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from giril_rl.errors import UserError
+from giril_rl.overrides import KeyCheck, check_settings, normalised, parse
+from giril_rl.recipes import Recipe, shipped_conf
+
+SCHEMA = "recipe_schema"
+"""The entry in a YAML's defaults list that stands for the recipe's own ``Config`` class."""
+
+
+@dataclass(frozen=True)
+class Composed:
+    """A composed configuration: unresolved, with the changes that made it.
+
+    Attributes:
+        node: Hydra's result, of the recipe's ``Config`` type.
+        changes: the user's overrides as ``{key: "key=value"}`` in one spelling.
+    """
+
+    node: DictConfig
+    changes: dict[str, str]
+
+    def config(self) -> Any:
+        """The instance of ``Config`` with every interpolation resolved.
+
+        Raises:
+            UserError: where a mandatory value is missing or an interpolation leads nowhere.
+        """
+        for key in _missing(OmegaConf.to_container(self.node, resolve=False)):
+            hint = "Pendulum-v1" if key == "task.env_id" else "VALUE"
+            raise UserError(f"{key} has no value: give one, such as {key}={hint}.")
+        try:
+            OmegaConf.resolve(self.node)
+            return OmegaConf.to_object(self.node)
+        except OmegaConfBaseException as error:
+            where = f"{error.full_key}: " if error.full_key else ""
+            raise UserError(f"{where}{_first_line(error)}.") from error
+
+
+def _missing(values: Any, prefix: str = "") -> Iterator[str]:
+    # Not OmegaConf.missing_keys: it raises at an interpolation of a missing value.
+    for name, value in values.items():
+        if isinstance(value, dict):
+            yield from _missing(value, f"{prefix}{name}.")
+        elif value == "???":
+            yield f"{prefix}{name}"
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).strip().splitlines() or [type(error).__name__])[0].rstrip(".")
+
+
+def _load_settings(recipe: Recipe) -> DictConfig:
+    import yaml
+
+    try:
+        loaded = OmegaConf.load(recipe.yaml)
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        line = f", line {mark.line + 1}" if mark else ""
+        raise UserError(f"{recipe.yaml} is not valid YAML{line}.") from error
+    if not isinstance(loaded, DictConfig) or SCHEMA not in loaded.get("defaults", []):
+        raise UserError(f"{recipe.yaml} needs a `defaults` list with `{SCHEMA}` in it.")
+    return loaded
+
+
+def groups(recipe: Recipe) -> dict[str, tuple[list[str], str]]:
+    """A recipe's config groups, each with all its choices and the default one.
+
+    A group is what the YAML's defaults list names as ``group: choice``; its choices are the files
+    in the folder of that name beside the YAML and among the shipped settings.
+
+    Examples:
+        >>> from giril_rl.recipes import find
+        >>> groups(find("giril"))["profile"]
+        (['paper', 'released'], 'released')
+    """
+    found = {}
+    for entry in _load_settings(recipe).defaults:
+        if isinstance(entry, DictConfig):
+            ((group, default),) = entry.items()
+            folders = (recipe.yaml.parent / str(group), shipped_conf() / str(group))
+            names = {file.stem for folder in folders for file in folder.glob("*.yaml")}
+            found[str(group)] = (sorted(names), str(default))
+    return found
+
+
+def _with_task(texts: Sequence[str]) -> list[str]:
+    keys = [text.partition("=")[0] for text in texts]
+    if "task.env_id" in keys and "task" not in keys:
+        return ["task=gymnasium", *texts]
+    return list(texts)
+
+
+def compose(recipe: Recipe, config: type[Any], texts: Sequence[str]) -> Composed:
+    """Compose one configuration; values may still be missing or interpolations.
+
+    ``task.env_id=X`` without ``task=`` chooses the task ``gymnasium``, named after the environment.
+
+    Args:
+        recipe: whose YAML is the primary configuration.
+        config: the recipe's ``Config`` class, which fixes keys and types.
+        texts: ``key=value``, one value each.
+
+    Raises:
+        UserError: one sentence that names the override or file at fault.
+
+    Examples:
+        >>> from giril_rl.configs import RunConfig
+        >>> from giril_rl.recipes import find
+        >>> composed = compose(find("giril"), RunConfig, ["task.env_id=Pendulum-v1", "steps=1000"])
+        >>> composed.config().task.name, composed.config().steps
+        ('Pendulum-v1', 1000)
+    """
+    choices = {group: names for group, (names, _) in groups(recipe).items()}
+    check = KeyCheck(recipe.word, config, choices)
+    settings = OmegaConf.to_container(_load_settings(recipe), resolve=False)
+    assert isinstance(settings, dict)
+    check_settings(check, settings, str(recipe.yaml))  # type: ignore[arg-type]
+    overrides = parse(_with_task(texts))
+    for override in overrides:
+        check.override(override)
+
+    ConfigStore.instance().store(name=SCHEMA, node=config)
+    lines = [normalised(override) for override in overrides]
+    search = f"hydra.searchpath=[{_quoted('file://' + str(shipped_conf()))}]"
+    try:
+        with initialize_config_dir(config_dir=str(recipe.yaml.parent), version_base="1.3"):
+            node = hydra_compose(recipe.yaml.name, [*lines, search])
+    except (HydraException, OmegaConfBaseException) as error:
+        cause = error.__cause__ if isinstance(error.__cause__, Exception) else error
+        raise UserError(f"{recipe.yaml} cannot be composed: {_first_line(cause)}.") from error
+    changes = {override.get_key_element(): normalised(override) for override in overrides}
+    return Composed(node, changes)
+
+
+def _quoted(text: str) -> str:
+    escaped = text.replace("'", "\\'")
+    return f"'{escaped}'"
+
+
+def resolved(recipe: Recipe, config: type[Any], texts: Sequence[str]) -> tuple[Any, dict[str, str]]:
+    """The validated ``Config`` of one job and the user's changes, see :class:`Composed`.
+
+    Raises:
+        UserError: as :func:`compose`, and for values that
+            :func:`~giril_rl.validation.validate` refuses.
+    """
+    from giril_rl.validation import validate
+
+    composed = compose(recipe, config, texts)
+    built = composed.config()
+    assert is_dataclass(built)
+    validate(built)
+    return built, composed.changes

@@ -1,0 +1,18 @@
+"""Demonstrations: record, check, keep, subsample, and export to Minari."""
+
+from giril_rl.demos.check import check_demonstration
+from giril_rl.demos.demonstration import Demonstration
+from giril_rl.demos.minari import to_minari
+from giril_rl.demos.record import record_demonstration
+from giril_rl.demos.replay import verify_by_replay
+from giril_rl.demos.subsample import holdout, subsample
+
+__all__ = [
+    "Demonstration",
+    "check_demonstration",
+    "holdout",
+    "record_demonstration",
+    "subsample",
+    "to_minari",
+    "verify_by_replay",
+]

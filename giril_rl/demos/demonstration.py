@@ -1,0 +1,132 @@
+"""What an expert did: aligned transitions, and a card that says where they come from."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from giril_rl.demos.check import check_demonstration
+from giril_rl.demos.storage import load_tensors, save_tensors
+from giril_rl.errors import UserError
+from giril_rl.files import read_json, temporary_sibling, write_json
+
+FORMAT_VERSION = 1
+
+
+@dataclass(eq=False)
+class Demonstration:
+    """Transitions (s_t, a_t, s_{t+1}) of whole episodes in the order in which they were played.
+
+    Args:
+        transitions: flat TensorDict, batch [N]: ``observation`` float32 [N, d], raw, before any
+            running normalisation; ``action``, as executed, float32 [N, a] or int64 [N];
+            ``("next", "observation")``, at an episode's end the true terminal observation;
+            ``("next", "reward" | "done" | "terminated" | "truncated")`` [N, 1]; ``episode`` and
+            ``step`` int64 [N], both counted from 0.
+        card: plain JSON values. ``length`` is the fixed number of transitions, which may cut the
+            last episode, or None if all episodes are whole; ``seeds`` has one reset seed per
+            episode. See :func:`giril_rl.demos.record_demonstration` for the others.
+
+    Examples:
+        >>> import gymnasium
+        >>> from giril_rl.demos import record_demonstration
+        >>> balance = lambda observation: (observation[:, 2] + observation[:, 3] > 0).long()
+        >>> demo = record_demonstration(
+        ...     lambda: gymnasium.make("CartPole-v1"), balance, episodes=2, seed=0
+        ... )
+        >>> bool((demo.returns == demo.lengths).all())  # CartPole pays 1 a step
+        True
+        >>> demo.num_episodes, demo.transitions["next", "observation"].shape[-1]
+        (2, 4)
+    """
+
+    transitions: TensorDict
+    card: dict[str, Any] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return self.transitions.shape[0]
+
+    @property
+    def num_episodes(self) -> int:
+        """How many episodes there are, the cut one included."""
+        return int(self.transitions["episode"].max()) + 1 if len(self) else 0
+
+    @property
+    def returns(self) -> Tensor:
+        """Undiscounted true return of each episode, float64 [num_episodes]."""
+        rewards = self.transitions["next", "reward"].reshape(-1).double()
+        sums = torch.zeros(self.num_episodes, dtype=torch.float64)
+        return sums.index_add(0, self.transitions["episode"], rewards)
+
+    @property
+    def lengths(self) -> Tensor:
+        """Transitions of each episode, int64 [num_episodes]."""
+        return torch.bincount(self.transitions["episode"], minlength=self.num_episodes)
+
+    def save(self, folder: Path | str) -> None:
+        """Write ``folder`` at once: a TensorDict memmap of tensors only, and ``card.json``.
+
+        Raises:
+            UserError: if the demonstration is not sound, or ``folder`` is there already.
+
+        Examples:
+            >>> import tempfile, gymnasium
+            >>> from giril_rl.demos import record_demonstration
+            >>> demo = record_demonstration(
+            ...     lambda: gymnasium.make("CartPole-v1"), lambda o: o.new_ones(1).long(),
+            ...     length=30, seed=0,
+            ... )
+            >>> folder = Path(tempfile.mkdtemp()) / "demo"
+            >>> demo.save(folder)
+            >>> bool((Demonstration.load(folder).transitions == demo.transitions).all())
+            True
+        """
+        folder = Path(folder)
+        check_demonstration(self)
+        if folder.is_file() or (folder.is_dir() and any(folder.iterdir())):
+            raise UserError(f"{folder} is there already: choose another folder, or delete it.")
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        temporary = temporary_sibling(folder)
+        shutil.rmtree(temporary, ignore_errors=True)
+        try:
+            save_tensors(temporary / "transitions", self.transitions)
+            write_json(temporary / "card.json", {"format_version": FORMAT_VERSION, **self.card})
+            temporary.replace(folder)
+        except BaseException:
+            shutil.rmtree(temporary, ignore_errors=True)
+            raise
+
+    @classmethod
+    def load(cls, folder: Path | str) -> Demonstration:
+        """Read and check what :meth:`save` wrote; tensors are in memory, apart from the files.
+
+        Nothing is unpickled: all metadata is inspected before anything is loaded, and a folder that
+        holds more than plain tensors is refused.
+
+        Raises:
+            UserError: if something is missing, damaged, of another format or not sound.
+        """
+        folder = Path(folder)
+        if not (folder / "card.json").is_file():
+            raise UserError(
+                f"{folder} is not a demonstration (no card.json): check the path, "
+                "or record one anew."
+            )
+        card = read_json(folder / "card.json")
+        if card.get("format_version") != FORMAT_VERSION:
+            raise UserError(
+                f"{folder} has demonstration format {card.get('format_version')!r} and this "
+                f"version of giril_rl reads only {FORMAT_VERSION}: record it anew."
+            )
+        demo = cls(load_tensors(folder / "transitions"), card)
+        try:
+            check_demonstration(demo)
+        except UserError as error:
+            raise UserError(f"{folder}: {error}") from None
+        return demo

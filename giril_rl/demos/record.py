@@ -1,0 +1,195 @@
+"""Watch a policy play, and keep what it saw and did in step."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium
+import numpy as np
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from giril_rl.demos.check import check_demonstration
+from giril_rl.demos.demonstration import Demonstration
+from giril_rl.demos.replay import as_executed, as_recorded, verify_by_replay
+from giril_rl.errors import UserError
+from giril_rl.files import installed_versions
+from giril_rl.progress import progress
+
+_LONGEST_EPISODE = 1_000_000
+
+
+def episode_seed(seed: int, episode: int) -> int:
+    """The reset seed of one episode: distinct for all episodes of all root seeds, in practice.
+
+    Examples:
+        >>> len({episode_seed(seed, episode) for seed in range(3) for episode in range(100)})
+        300
+    """
+    return int(np.random.SeedSequence([seed, episode]).generate_state(1)[0])
+
+
+def record_demonstration(
+    make_fn: Callable[[], gymnasium.Env],
+    policy: Callable[[Tensor], Tensor],
+    *,
+    seed: int,
+    length: int | None = None,
+    episodes: int | None = None,
+    deterministic: bool = True,
+    task: str | None = None,
+    expert: dict[str, Any] | None = None,
+    show_progress: bool = True,
+) -> Demonstration:
+    """Record transitions as they were, then prove them by check and by replay.
+
+    Every episode has a seed of its own, so a deterministic policy does not play the same episode
+    twice. Actions are stored as executed: clipped to the bounds of a Box. Torch's generator
+    is seeded for the recording and put back, so a sampled policy repeats as well.
+
+    Args:
+        make_fn: makes the Gymnasium environment: flat observation, Box or Discrete actions.
+        policy: observation float32 [1, d] -> action float [1, a] (Box) or int64 [1] (Discrete);
+            what it returns is played, so it decides itself between mean and sample.
+        seed: root of the episodes' seeds.
+        length: number of transitions; the last episode is cut where it is reached.
+        episodes: number of whole episodes, instead of ``length``.
+        deterministic: how ``policy`` chooses, for the card.
+        task: the task's name, for the card.
+        expert: score and source of the policy, for the card; plain JSON values.
+        show_progress: show a progress bar.
+
+    Returns:
+        The demonstration; its card has ``task``, ``env_id``, ``seed``, ``seeds``, ``length``,
+        ``deterministic``, ``expert``, ``versions``, ``transitions`` and ``episode_returns``.
+
+    Raises:
+        UserError: unless exactly one of ``length`` and ``episodes`` is positive; for an action that
+            is not finite or not in the space; for an environment that does not repeat.
+
+    Examples:
+        >>> demo = record_demonstration(
+        ...     lambda: gymnasium.make("CartPole-v1"), lambda o: torch.ones(1, dtype=torch.int64),
+        ...     length=20, seed=0,
+        ... )
+        >>> len(demo), demo.transitions["next", "done"].sum().item(), demo.num_episodes
+        (20, 2, 3)
+    """
+    if (length is None) == (episodes is None) or (length or episodes or 0) < 1:
+        raise UserError(
+            f"demo.length={length} and demo.episodes={episodes}: give exactly one of them, at "
+            "least 1, and null for the other."
+        )
+    env = make_fn()
+    rows: list[dict[str, Any]] = []
+    seeds: list[int] = []
+    total, unit = (length, "steps") if length is not None else (episodes, "episodes")
+    try:
+        with (
+            torch.random.fork_rng(devices=[]),
+            torch.no_grad(),
+            progress(total or 0, desc="demonstration", unit=unit) as bar,
+        ):
+            torch.default_generator.manual_seed(episode_seed(seed, 0))
+            while len(rows) < length if length is not None else len(seeds) < (episodes or 0):
+                seeds.append(episode_seed(seed, len(seeds)))
+                most = _LONGEST_EPISODE if length is None else length - len(rows)
+                played = _play(env, policy, seeds[-1], most)
+                if length is None and not played[-1]["done"]:
+                    raise UserError(
+                        f"an episode did not end within {most:,} steps: give the task a "
+                        "max_episode_steps, or set demo.length."
+                    )
+                rows += [{"episode": len(seeds) - 1, "step": i, **r} for i, r in enumerate(played)]
+                bar.update(1 if length is None else len(played))
+    finally:
+        env.close()
+    demo = Demonstration(_stack(rows))
+    demo.card = {
+        "task": task,
+        "env_id": env.spec.id if env.spec is not None else None,
+        "seed": seed,
+        "seeds": seeds,
+        "length": length,
+        "deterministic": deterministic,
+        "expert": expert,
+        "versions": installed_versions(),
+        "transitions": len(demo),
+        "episode_returns": demo.returns.tolist(),
+    }
+    check_demonstration(demo)
+    verify_by_replay(demo, make_fn)
+    return demo
+
+
+def _play(
+    env: gymnasium.Env, policy: Callable[[Tensor], Tensor], seed: int, most: int
+) -> list[dict[str, Any]]:
+    """One episode from ``seed``, or its first ``most`` transitions."""
+    rows: list[dict[str, Any]] = []
+    observation, _ = env.reset(seed=seed)
+    before = as_recorded(observation)
+    while len(rows) < most:
+        action = _choose(policy, before, env.action_space)
+        observation, reward, terminated, truncated, _ = env.step(
+            as_executed(action, env.action_space)
+        )
+        after = as_recorded(observation)
+        rows.append(
+            {
+                "observation": before,
+                "action": action,
+                "next": after,
+                "reward": float(reward),
+                "terminated": bool(terminated),
+                "truncated": bool(truncated),
+                "done": bool(terminated or truncated),
+            }
+        )
+        before = after
+        if terminated or truncated:
+            break
+    return rows
+
+
+def _choose(
+    policy: Callable[[Tensor], Tensor], observation: np.ndarray, space: gymnasium.Space
+) -> np.ndarray | int:
+    """The policy's action as it will be executed and stored: float32 [a], or an int."""
+    output = policy(torch.from_numpy(observation).unsqueeze(0)).detach().cpu()[0].numpy()
+    if isinstance(space, gymnasium.spaces.Box):
+        if not np.isfinite(output).all():
+            raise UserError(f"the policy's action {output.tolist()} is not finite: check it.")
+        low, high = space.low.reshape(-1), space.high.reshape(-1)
+        return np.clip(output.reshape(-1).astype(np.float32), low, high).astype(np.float32)
+    if output.ndim != 0 or not np.issubdtype(output.dtype, np.integer):
+        raise UserError(
+            f"the policy's action {output.tolist()} is not one integer: a Discrete action space "
+            "takes int64 [1]."
+        )
+    if not space.contains(int(output)):
+        raise UserError(f"the policy's action {int(output)} is not in {space}: check the policy.")
+    return int(output)
+
+
+def _stack(rows: list[dict[str, Any]]) -> TensorDict:
+    def column(name: str, dtype: torch.dtype) -> Tensor:
+        return torch.as_tensor(np.stack([row[name] for row in rows]), dtype=dtype)
+
+    discrete = isinstance(rows[0]["action"], int)
+    after = {"observation": column("next", torch.float32)}
+    after["reward"] = column("reward", torch.float32).unsqueeze(-1)
+    for name in ("done", "terminated", "truncated"):
+        after[name] = column(name, torch.bool).unsqueeze(-1)
+    return TensorDict(
+        {
+            "observation": column("observation", torch.float32),
+            "action": column("action", torch.int64 if discrete else torch.float32),
+            "episode": column("episode", torch.int64),
+            "step": column("step", torch.int64),
+            "next": TensorDict(after, [len(rows)]),
+        },
+        [len(rows)],
+    )

@@ -1,0 +1,92 @@
+"""A folder of memory-mapped tensors, read without any way to run code."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDict
+
+from giril_rl.errors import UserError
+from giril_rl.files import sync
+
+_DTYPES = {f"torch.{name}": getattr(torch, name) for name in ("float32", "int64", "bool")}
+_TENSORDICT = "<class 'tensordict._td.TensorDict'>"
+
+
+def save_tensors(folder: Path, transitions: TensorDict) -> None:
+    """Write ``transitions`` with ``TensorDict.memmap`` and wait for the disk."""
+    transitions.detach().cpu().contiguous().memmap(folder, copy_existing=True)
+    for path in sorted(folder.rglob("*"), reverse=True):
+        sync(path)
+
+
+def load_tensors(folder: Path) -> TensorDict:
+    """Copy a folder of :func:`save_tensors` into memory, after looking at every file of it.
+
+    A memmap is written through to its files, so a copy is what keeps a demonstration as recorded.
+
+    Raises:
+        UserError: for anything that is not a plain tensor of the size that its metadata says.
+
+    Examples:
+        >>> import tempfile
+        >>> folder = Path(tempfile.mkdtemp())
+        >>> _ = TensorDict({"note": "text is not a tensor"}).memmap(folder)
+        >>> load_tensors(folder)  # doctest: +ELLIPSIS
+        Traceback (most recent call last):
+        ...
+        giril_rl.errors.UserError: ... holds 'note', which is not a plain tensor: ...
+    """
+    _inspect(folder, top=True)
+    try:
+        return TensorDict.load_memmap(folder, allow_pickle=False).clone()
+    except (OSError, RuntimeError, ValueError, KeyError, TypeError) as error:
+        raise UserError(f"{folder} cannot be read ({error}): record it anew.") from None
+
+
+def _inspect(folder: Path, *, top: bool) -> None:
+    try:
+        meta = json.loads((folder / "meta.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise UserError(f"{folder} is damaged ({error}): record it anew.") from None
+    if not isinstance(meta, dict) or meta.get("_type") != _TENSORDICT:
+        raise UserError(f"{folder} holds something other than a TensorDict: record it anew.")
+    expected = {"meta.json"}
+    for key, entry in meta.items():
+        if key in ("shape", "device", "_type"):
+            continue
+        if top and key == "next" and entry == {"type": "TensorDict"}:
+            expected.add("next")
+            _inspect(folder / "next", top=False)
+        else:
+            _inspect_tensor(folder, key, entry)
+            expected.add(f"{key}.memmap")
+    # A stray file may be what an object is unpickled from.
+    strays = sorted(path.name for path in folder.iterdir() if path.name not in expected)
+    if strays:
+        raise UserError(f"{folder} holds {strays[0]!r}, which is not a tensor: record it anew.")
+
+
+def _inspect_tensor(folder: Path, key: str, entry: Any) -> None:
+    # Keys are the demonstration's own names: letters only, so none is a path.
+    if (
+        not key.isidentifier()
+        or not isinstance(entry, dict)
+        or set(entry) != {"device", "shape", "dtype", "is_nested"}
+        or entry["dtype"] not in _DTYPES
+        or entry["is_nested"] is not False
+        or entry["device"] != "cpu"
+        or not isinstance(entry["shape"], list)
+        or not all(type(size) is int and size >= 0 for size in entry["shape"])
+    ):
+        raise UserError(f"{folder} holds {key!r}, which is not a plain tensor: record it anew.")
+    path = folder / f"{key}.memmap"
+    wanted = math.prod(entry["shape"]) * _DTYPES[entry["dtype"]].itemsize
+    found = path.stat().st_size if path.is_file() else None
+    if found != wanted:
+        state = "is missing" if found is None else f"has {found} bytes instead of {wanted}"
+        raise UserError(f"{path} {state}: restore a copy, or record the demonstration anew.")

@@ -1,0 +1,110 @@
+"""Writing files so that a kill at any moment leaves either the old content or the new."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import sys
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+from giril_rl.errors import UserError
+
+PACKAGES = ("torch", "torchrl", "tensordict", "gymnasium", "pybullet", "giril-rl")
+
+
+def temporary_sibling(path: Path) -> Path:
+    """The hidden name beside ``path`` under which this process prepares its next content.
+
+    Examples:
+        >>> temporary_sibling(Path("runs/a.json")).match("runs/.a.json.*.tmp")
+        True
+    """
+    return path.with_name(f".{path.name}.{os.getpid()}.tmp")
+
+
+def sync(path: Path) -> None:
+    """Ask the disk to keep ``path``, a file or a folder, through a power cut."""
+    if path.is_dir() and os.name == "nt":  # Windows cannot open a folder
+        return
+    handle = os.open(path, os.O_RDONLY if path.is_dir() else os.O_RDWR)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def write_atomically(path: Path, content: bytes | str) -> None:
+    """Write ``content`` to ``path`` at once: a reader, or a kill, never meets half a file.
+
+    Args:
+        path: the file; its folder is made if need be.
+        content: bytes, or text that is written as UTF-8.
+
+    Examples:
+        >>> import tempfile
+        >>> path = Path(tempfile.mkdtemp()) / "note.txt"
+        >>> write_atomically(path, "kept")
+        >>> path.read_text(), [file.name for file in path.parent.iterdir()]
+        ('kept', ['note.txt'])
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    data = content.encode() if isinstance(content, str) else content
+    temporary = temporary_sibling(path)
+    try:
+        with open(temporary, "wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            temporary.unlink()
+        raise
+    sync(path.parent)
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Write ``value`` as indented JSON, atomically.
+
+    Examples:
+        >>> import tempfile
+        >>> path = Path(tempfile.mkdtemp()) / "result.json"
+        >>> write_json(path, {"return_mean": 990.2})
+        >>> read_json(path)
+        {'return_mean': 990.2}
+    """
+    write_atomically(path, json.dumps(value, indent=2) + "\n")
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """The JSON object in ``path``.
+
+    Raises:
+        UserError: if the file cannot be read or does not hold a JSON object.
+    """
+    try:
+        value = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise UserError(f"{path} cannot be read as JSON ({error}): delete or restore it.") from None
+    if not isinstance(value, dict):
+        raise UserError(f"{path} does not hold a JSON object: delete or restore it.")
+    return value
+
+
+def installed_versions() -> dict[str, str | None]:
+    """Versions of Python and of the packages that decide a run's numbers; None if not installed.
+
+    Examples:
+        >>> sorted(installed_versions())
+        ['giril_rl', 'gymnasium', 'pybullet', 'python', 'tensordict', 'torch', 'torchrl']
+    """
+    versions: dict[str, str | None] = {"python": ".".join(map(str, sys.version_info[:3]))}
+    for name in PACKAGES:
+        try:
+            versions[name.replace("-", "_")] = version(name)
+        except PackageNotFoundError:
+            versions[name.replace("-", "_")] = None
+    return versions

@@ -1,0 +1,99 @@
+"""Names of runs: where one is kept, and the hash by which two are known to be the same."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+_OWN_PLACE = {"task", "task.name", "seed"}
+_NO_EFFECT = {"out", "root", "logger", "threads"}
+_LONGEST = 80
+
+
+def config_hash(config: Any) -> str:
+    """Twelve hex digits of the configuration, less what cannot change a result.
+
+    sha256 of the resolved configuration as JSON with sorted keys, without ``out``, ``root``,
+    ``logger`` and ``threads``.
+
+    Args:
+        config: an instance of a recipe's ``Config``.
+
+    Examples:
+        >>> from giril_rl.configs import RunConfig
+        >>> config_hash(RunConfig(seed=1)) == config_hash(RunConfig(seed=1, root="elsewhere"))
+        True
+    """
+    values = {key: value for key, value in asdict(config).items() if key not in _NO_EFFECT}
+    return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:12]
+
+
+def safe(name: str, *, distinct: bool = False) -> str:
+    """``name`` as one component of a path, at most 80 characters long.
+
+    Quotes and brackets go, other unsafe characters become ``-``. A name that is too long is cut and
+    ends in 8 hex digits of its hash.
+
+    Args:
+        name: any text.
+        distinct: add the hash also where a character was replaced: ``a/b`` and ``a-b`` differ.
+
+    Examples:
+        >>> safe("ppo.hidden=[64,64]")
+        'ppo.hidden=64,64'
+        >>> safe("ALE/Pong-v5"), safe("ALE/Pong-v5", distinct=True)
+        ('ALE-Pong-v5', 'ALE-Pong-v5-d3b6e4aa')
+        >>> len(safe("x" * 200))
+        80
+    """
+    bare = re.sub(r"[\[\]'\"]", "", name)
+    clean = re.sub(r"[^A-Za-z0-9._=,+-]", "-", bare).lstrip(".") or "-"
+    if len(clean) <= _LONGEST and (clean == bare or not distinct):
+        return clean
+    digest = hashlib.sha256(name.encode()).hexdigest()[:8]
+    return f"{clean[: _LONGEST - 9]}-{digest}"
+
+
+def variant(changes: Mapping[str, str], without: frozenset[str] = frozenset()) -> str:
+    """The part of a run's path that names the user's changes, ``default`` where there are none.
+
+    Args:
+        changes: ``{key: "key=value"}``.
+        without: further keys to leave out.
+
+    Examples:
+        >>> variant({"seed": "seed=3", "ppo.lr": "ppo.lr=0.001", "profile": "profile=paper"})
+        'ppo.lr=0.001,profile=paper'
+        >>> variant({"seed": "seed=3"})
+        'default'
+    """
+    left_out = _OWN_PLACE | _NO_EFFECT | without
+    kept = sorted(text for key, text in changes.items() if key not in left_out)
+    return safe(",".join(kept), distinct=True) if kept else "default"
+
+
+def out_folder(recipe: str, config: Any, changes: Mapping[str, str]) -> Path:
+    """The run's folder: ``out`` where it is given, else ``root/recipe/task/variant/seedN``.
+
+    Args:
+        recipe: the recipe's name.
+        config: an instance of its ``Config``.
+        changes: ``{key: "key=value"}``, the user's overrides.
+
+    Examples:
+        >>> from giril_rl.configs import RunConfig, TaskConfig
+        >>> config = RunConfig(task=TaskConfig(name="reach", env_id="Reach-v0"), seed=3)
+        >>> out_folder("giril", config, {"seed": "seed=3"}).as_posix()
+        'runs/giril/reach/default/seed3'
+    """
+    if config.out is not None:
+        return Path(config.out)
+    # The folder of a task that is named after its environment names the environment already.
+    named = frozenset({"task.env_id"} if config.task.name == config.task.env_id else ())
+    place = Path(config.root) / safe(recipe) / safe(config.task.name)
+    return place / variant(changes, named) / f"seed{config.seed}"

@@ -1,0 +1,134 @@
+"""The policy and value network of PPO, as the collector, the loss and the evaluation see them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
+from torch import Tensor, nn
+from torchrl.data import Categorical, TensorSpec
+from torchrl.envs.utils import ExplorationType, exploration_type
+
+from giril_rl.networks.distributions import CategoricalActions, DiagonalGaussian
+from giril_rl.networks.normalise import RunningNormaliser
+from giril_rl.networks.vectors import mlp
+
+NORMALISED = "normalised"
+
+
+class ActorCritic(nn.Module):
+    """Separate policy and value networks over one running observation normalisation.
+
+    Gaussian actions with a standard deviation that does not depend on the state (first 1), or
+    categorical ones. Orthogonal initialisation with gain sqrt(2), the policy's head 0.01, the
+    value's 1.
+
+    Args:
+        observation_size: size of the observation vector.
+        action_spec: the environment's action spec, Box-like or :class:`torchrl.data.Categorical`.
+        hidden: hidden layers of either network (tanh); the paper uses two of 100.
+        normalise: whether observations are normalised with running statistics.
+
+    Examples:
+        >>> from torchrl.data import Categorical
+        >>> agent = ActorCritic(4, Categorical(2, shape=(1,)))
+        >>> policy = agent.acting()
+        >>> policy(TensorDict({"observation": torch.zeros(3, 4)}, [3]))["action"].shape
+        torch.Size([3])
+    """
+
+    def __init__(
+        self,
+        observation_size: int,
+        action_spec: TensorSpec,
+        *,
+        hidden: Sequence[int] = (100, 100),
+        normalise: bool = True,
+    ) -> None:
+        super().__init__()
+        self.discrete = isinstance(action_spec, Categorical)
+        size = action_spec.space.n if self.discrete else action_spec.shape[-1]
+        self.normaliser = RunningNormaliser(observation_size) if normalise else nn.Identity()
+        self.actor = _orthogonal(mlp(observation_size, size, hidden), head_gain=0.01)
+        self.critic = _orthogonal(mlp(observation_size, 1, hidden), head_gain=1.0)
+        self.log_std = None if self.discrete else nn.Parameter(torch.zeros(size))
+
+    def distribution(self, normalised: Tensor) -> DiagonalGaussian | CategoricalActions:
+        """The action distribution given normalised observations ``(*batch, observation_size)``."""
+        out = self.actor(normalised)
+        if self.log_std is None:
+            return CategoricalActions(out)
+        return DiagonalGaussian(out, self.log_std)
+
+    def update_normaliser(self, observation: Tensor) -> None:
+        """Merges raw observations into the running statistics, if there are any."""
+        if isinstance(self.normaliser, RunningNormaliser):
+            self.normaliser.update(observation)
+
+    def acting(self) -> ActingPolicy:
+        """The module that acts in an environment; shares this one's parameters."""
+        return ActingPolicy(self)
+
+    def actor_for_loss(self) -> LossActor:
+        """The module that gives :class:`torchrl.objectives.ClipPPOLoss` its distribution."""
+        return LossActor(self)
+
+    def critic_for_loss(self) -> TensorDictModule:
+        """The value network on normalised observations, writing ``"state_value"``."""
+        return TensorDictModule(self.critic, in_keys=[NORMALISED], out_keys=["state_value"])
+
+
+class ActingPolicy(TensorDictModuleBase):
+    """Samples an action, or takes the mode under ``ExplorationType.DETERMINISTIC``.
+
+    Reads raw ``"observation"``; writes ``"action"``, ``"action_log_prob"`` and the normalised
+    observation, which the loss reads again and so need not compute.
+    """
+
+    def __init__(self, agent: ActorCritic) -> None:
+        super().__init__()
+        self.in_keys = ["observation"]
+        self.out_keys = ["action", "action_log_prob", NORMALISED]
+        self.agent = agent
+
+    @torch.no_grad()
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes the action for ``"observation"`` of any leading shape."""
+        normalised = self.agent.normaliser(tensordict.get("observation"))
+        distribution = self.agent.distribution(normalised)
+        greedy = exploration_type() == ExplorationType.DETERMINISTIC
+        action = distribution.mode if greedy else distribution.sample()
+        tensordict.set("action", action)
+        tensordict.set("action_log_prob", distribution.log_prob(action))
+        tensordict.set(NORMALISED, normalised)
+        return tensordict
+
+
+class LossActor(TensorDictModuleBase):
+    """Gives the action distribution for normalised observations."""
+
+    def __init__(self, agent: ActorCritic) -> None:
+        super().__init__()
+        self.in_keys = [NORMALISED]
+        self.out_keys = ["action"]
+        self.agent = agent
+
+    def get_dist(self, tensordict: TensorDictBase) -> DiagonalGaussian | CategoricalActions:
+        """The distribution that the loss evaluates the recorded actions under."""
+        return self.agent.distribution(tensordict.get(NORMALISED))
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes the distribution's mode as the action."""
+        return tensordict.set("action", self.get_dist(tensordict).mode)
+
+
+def _orthogonal(network: nn.Sequential, *, head_gain: float) -> nn.Sequential:
+    layers = [layer for layer in network if isinstance(layer, nn.Linear)]
+    for layer in layers:
+        gain = head_gain if layer is layers[-1] else math.sqrt(2)
+        nn.init.orthogonal_(layer.weight, gain)
+        nn.init.zeros_(layer.bias)
+    return network

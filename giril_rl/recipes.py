@@ -1,0 +1,150 @@
+"""Recipes as files: the shipped ones, copies of them, and how one is loaded.
+
+A recipe is a Python file with a docstring, a dataclass ``Config`` (of
+:class:`giril_rl.configs.RunConfig`) and ``main(cfg: Config, out: Path) -> None``. Its settings are
+a YAML file: ``conf/NAME.yaml`` for a shipped recipe, the same name with the suffix ``.yaml`` beside
+a copied one. Importing this module imports neither torch nor Hydra.
+"""
+
+from __future__ import annotations
+
+import ast
+import importlib.util
+import shutil
+import sys
+from dataclasses import dataclass, is_dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from giril_rl.configs import RunConfig
+from giril_rl.errors import UserError
+from giril_rl.nearest import did_you_mean
+
+
+def shipped_folder() -> Path:
+    """The folder of shipped recipes: inside an installed wheel, or beside the package's sources."""
+    package = Path(__file__).resolve().parent
+    inside = package / "_recipes"
+    return inside if inside.is_dir() else package.parent / "recipes"
+
+
+def shipped_conf() -> Path:
+    """The folder of the shipped recipes' YAML and of its groups ``task`` and ``profile``."""
+    return shipped_folder() / "conf"
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """A recipe's Python file and its YAML file.
+
+    Attributes:
+        word: what names it on the command line, a name or a path.
+        path: its Python file.
+        yaml: its settings.
+    """
+
+    word: str
+    path: Path
+    yaml: Path
+
+    @property
+    def name(self) -> str:
+        """The file's name without its suffix, used for folders."""
+        return self.path.stem
+
+    @property
+    def docstring(self) -> str:
+        """The file's docstring, read without running the file; empty where there is none."""
+        try:
+            return ast.get_docstring(ast.parse(self.path.read_text("utf-8"))) or ""
+        except SyntaxError as error:
+            raise UserError(
+                f"{self.path} is not valid Python: {error.msg}, line {error.lineno}."
+            ) from error
+
+    def load(self) -> ModuleType:
+        """Run the recipe's file as a module and check that it has ``Config`` and ``main``."""
+        name = f"giril_recipe_{self.name}"
+        spec = importlib.util.spec_from_file_location(name, self.path)
+        if not self.docstring or spec is None or spec.loader is None:
+            raise UserError(
+                f"{self.path} begins with no docstring: say there what the recipe does."
+            )
+        module = importlib.util.module_from_spec(spec)
+        # Dataclasses look up their module by name when their annotations are read.
+        sys.modules[name] = module
+        spec.loader.exec_module(module)
+        self.check_config(getattr(module, "Config", None))
+        if not callable(getattr(module, "main", None)):
+            raise UserError(f"{self.path} has no `main(cfg, out)`.")
+        return module
+
+    def check_config(self, config: Any) -> type[Any]:
+        """``config`` itself, refused unless it is a dataclass of RunConfig."""
+        if isinstance(config, type) and is_dataclass(config) and issubclass(config, RunConfig):
+            return config
+        raise UserError(f"{self.path} has no `Config`, a dataclass of giril_rl.configs.RunConfig.")
+
+
+def shipped() -> list[Recipe]:
+    """All shipped recipes, by name.
+
+    Examples:
+        >>> "giril" in [recipe.name for recipe in shipped()]
+        True
+    """
+    return [
+        Recipe(path.stem, path, shipped_conf() / f"{path.stem}.yaml")
+        for path in sorted(shipped_folder().glob("*.py"))
+        if not path.stem.startswith("_")
+    ]
+
+
+def find(text: str) -> Recipe:
+    """The recipe that a user named: a shipped one's name, or the path of a copied file.
+
+    Args:
+        text: a name such as ``giril`` or a path that ends in ``.py``.
+
+    Raises:
+        UserError: for an unknown name, a missing file, or a file without its YAML.
+
+    Examples:
+        >>> find("girl")
+        Traceback (most recent call last):
+        ...
+        giril_rl.errors.UserError: 'girl' is not a recipe; did you mean 'giril'?
+    """
+    if text.endswith(".py"):
+        path = Path(text)
+        if not path.is_file():
+            raise UserError(f"there is no file {text}; `giril cp RECIPE {text}` makes one.")
+        settings = path.with_suffix(".yaml")
+        if not settings.is_file():
+            raise UserError(f"{text} needs its settings in {settings}: `giril cp` copies both.")
+        return Recipe(text, path.resolve(), settings.resolve())
+    by_name = {recipe.name: recipe for recipe in shipped()}
+    if text not in by_name:
+        hint = did_you_mean(text, by_name) or f": choose one of {', '.join(by_name)}."
+        raise UserError(f"{text!r} is not a recipe{hint}")
+    return by_name[text]
+
+
+def copy(recipe: Recipe, file: Path) -> tuple[Path, Path]:
+    """Copy a recipe's Python to ``file`` and its YAML beside it, and return both paths.
+
+    Raises:
+        UserError: where ``file`` does not end in ``.py``, or anything would be overwritten.
+    """
+    if file.suffix != ".py":
+        raise UserError(f"{file} does not end in .py: a recipe is a Python file.")
+    settings = file.with_suffix(".yaml")
+    for target in (file, settings):
+        if target.exists():
+            raise UserError(f"{target} exists: remove it or choose another name.")
+    if not file.parent.is_dir():
+        raise UserError(f"{file} cannot be written: there is no folder {file.parent}.")
+    shutil.copyfile(recipe.path, file)
+    shutil.copyfile(recipe.yaml, settings)
+    return file, settings

@@ -1,0 +1,1 @@
+"""Runs made readable: tables and curves."""

@@ -1,0 +1,106 @@
+"""Actions as the real vectors that encoder and decoder speak of."""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+from torchrl.data import (
+    Binary,
+    Bounded,
+    Categorical,
+    Composite,
+    MultiCategorical,
+    MultiOneHot,
+    OneHot,
+    TensorSpec,
+    Unbounded,
+)
+
+from giril_rl.errors import UserError
+
+
+class ActionEncoder(nn.Module):
+    """Turns an environment's actions into action codes of shape ``(*batch, size)``.
+
+    - Discrete, integers ``(*batch,)``: one-hot, as floats. One-hot actions: as floats.
+    - Box ``(*batch, size)``: clamped to the bounds, as the simulator does before it acts, then
+      mapped affinely from the bounds to [-1, 1]; a dimension without two finite bounds keeps its
+      unit.
+
+    Args:
+        spec: TorchRL's action spec, with or without the environment's batch dimensions, or a
+            Composite of nothing else.
+
+    Raises:
+        UserError: for a spec of another kind.
+
+    Examples:
+        >>> ActionEncoder(Categorical(3))(torch.tensor([2, 0])).tolist()
+        [[0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]
+        >>> ActionEncoder(Bounded(0.0, 4.0, shape=(1,)))(torch.tensor([[3.0], [9.0]])).tolist()
+        [[0.5], [1.0]]
+    """
+
+    low: Tensor
+    high: Tensor
+    offset: Tensor
+    scale: Tensor
+
+    def __init__(self, spec: TensorSpec) -> None:
+        super().__init__()
+        while isinstance(spec, Composite) and len(spec.keys()) == 1:
+            spec = next(iter(spec.values()))
+        self.discrete = isinstance(spec, (Categorical, OneHot))
+        self.one_hot = isinstance(spec, OneHot)
+        self.size = 0
+        if isinstance(spec, (MultiCategorical, MultiOneHot, Binary, Composite)):
+            raise _unsupported(spec)
+        if isinstance(spec, (Categorical, OneHot)):
+            self.size = int(spec.space.n)
+            return
+        continuous = isinstance(spec, (Bounded, Unbounded)) and spec.dtype.is_floating_point
+        if not continuous or not spec.shape:
+            raise _unsupported(spec)
+        self.size = spec.shape[-1]
+        low, high = (
+            bound.reshape(-1, self.size).to(device="cpu", dtype=torch.float64)
+            for bound in (spec.space.low, spec.space.high)
+        )
+        if (low != low[0]).any() or (high != high[0]).any():
+            raise UserError("the action bounds differ between environments: give them equal ones.")
+        # TorchRL writes "no bound" as the largest number of the dtype.
+        limit = torch.finfo(spec.dtype).max
+        low = torch.where(low[0] <= -limit, -torch.inf, low[0])
+        high = torch.where(high[0] >= limit, torch.inf, high[0])
+        bounded = low.isfinite() & high.isfinite() & (high > low)
+        offset = torch.where(bounded, (low + high) / 2, 0.0)
+        scale = torch.where(bounded, 2 / (high - low), 1.0)
+        for name, value in {"low": low, "high": high, "offset": offset, "scale": scale}.items():
+            self.register_buffer(name, value.to(torch.get_default_dtype()))
+
+    def forward(self, action: Tensor) -> Tensor:
+        """The action codes ``(*batch, size)``."""
+        if self.one_hot:
+            return action.to(torch.get_default_dtype())
+        if self.discrete:
+            return F.one_hot(action.long(), self.size).to(torch.get_default_dtype())
+        clamped = torch.clamp(action.to(self.low.dtype), self.low, self.high)
+        return (clamped - self.offset) * self.scale
+
+    def target(self, action: Tensor) -> Tensor:
+        """What the encoder's latent is fitted to: class indices if discrete, else the code."""
+        if self.one_hot:
+            return action.to(torch.uint8).argmax(-1)
+        return action.long() if self.discrete else self(action)
+
+    def extra_repr(self) -> str:
+        """Shows kind and size when printed."""
+        return f"{'discrete' if self.discrete else 'box'}, size={self.size}"
+
+
+def _unsupported(spec: TensorSpec) -> UserError:
+    return UserError(
+        f"an action spec of the kind {type(spec).__name__} with shape {tuple(spec.shape)} is not "
+        "supported: give a single Categorical, OneHot or one-dimensional Bounded or Unbounded one."
+    )

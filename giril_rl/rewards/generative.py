@@ -1,0 +1,218 @@
+"""GIRIL's reward: how badly a conditional VAE of the demonstration foresees a transition."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal, get_args
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase, dispatch
+from tensordict.utils import NestedKey
+from torch import Tensor, nn
+from torchrl.data import TensorSpec
+
+from giril_rl.errors import UserError
+from giril_rl.networks.vectors import mlp
+from giril_rl.rewards.actions import ActionEncoder
+from giril_rl.rewards.scaler import ObservationScaler, ScalingRule
+
+Prior = Literal["standard", "conditional"]
+
+IN_KEYS: tuple[NestedKey, ...] = ("observation", "action", ("next", "observation"))
+OUT_KEYS: tuple[NestedKey, ...] = (("next", "intrinsic_reward"),)
+
+
+def reconstruction_error(predicted: Tensor, target: Tensor) -> Tensor:
+    """The squared L2 norm of ``predicted - target`` over the last dimension (paper, eq. 2).
+
+    Times lambda it is also ``-log p(s' | z, s)`` up to a constant (eq. 1's first term).
+
+    Examples:
+        >>> reconstruction_error(torch.tensor([[1.0, 2.0]]), torch.tensor([[0.0, 4.0]]))
+        tensor([5.])
+    """
+    return (predicted - target).square().sum(-1)
+
+
+def blend_action(action_code: Tensor, encoded: Tensor, beta: float) -> Tensor:
+    """``beta * a + (1 - beta) * a_hat``, what the decoder gets at reward time (paper, eq. 2).
+
+    Examples:
+        >>> blend_action(torch.tensor([1.0, 0.0]), torch.tensor([0.5, 0.5]), 0.5)
+        tensor([0.7500, 0.2500])
+    """
+    return beta * action_code + (1 - beta) * encoded
+
+
+class GenerativeReward(TensorDictModuleBase):
+    """Eq. 2: ``r = lambda * ||decoder(beta * a + (1 - beta) * a_hat, s) - s'||^2``.
+
+    States are compared after the scaler; if the scaler clamps to [-1, 1], so is the prediction.
+    ``a_hat`` is softmax(z) for discrete actions and z for continuous ones, z sampled from
+    ``q(z | s, s')``. With ``beta=1`` the encoder takes no part and the reward is deterministic.
+    With ``beta<1`` the noise comes from a generator of the module's own, whose state is saved with
+    the module; a batch and the same transitions step by step then agree in distribution only.
+
+    Reads observation ``(*batch, d)``, action and next observation, writes one reward per
+    transition, ``(*batch, 1)``, without averaging. Train it with
+    :class:`~giril_rl.rewards.GenerativeRewardLoss`, after ``reward.scaler.fit(observations)``.
+
+    Args:
+        encoder: maps ``cat(s, s')`` to ``2 * latent`` numbers, mean and log-variance of z.
+        decoder: maps ``cat(action code, s)`` to the predicted next observation.
+        scaler: applied to both observations.
+        actions: turns actions into codes of the latent's size.
+        prior_network: maps s to mean and log-variance of ``p(z | s)``; None means N(0, I).
+        beta: weight of the true action, in (0, 1].
+        scale: lambda.
+        seed: seed of the noise.
+        in_keys: keys of observation, action and next observation.
+        out_keys: where the reward is written, one key.
+
+    Raises:
+        UserError: for a beta outside (0, 1].
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> from torchrl.data import Bounded
+        >>> reward = GenerativeReward.for_vectors(2, Bounded(-1, 1, shape=(1,)), normalise="raw")
+        >>> s, a = torch.zeros(4, 2), torch.zeros(4, 1)
+        >>> batch = TensorDict({"observation": s, "action": a, "next": {"observation": s}}, [4])
+        >>> reward(batch)["next", "intrinsic_reward"].shape
+        torch.Size([4, 1])
+    """
+
+    def __init__(
+        self,
+        encoder: nn.Module,
+        decoder: nn.Module,
+        *,
+        scaler: ObservationScaler,
+        actions: ActionEncoder,
+        prior_network: nn.Module | None = None,
+        beta: float = 1.0,
+        scale: float = 1.0,
+        seed: int = 0,
+        in_keys: Sequence[NestedKey] = IN_KEYS,
+        out_keys: Sequence[NestedKey] = OUT_KEYS,
+    ) -> None:
+        super().__init__()
+        if not 0 < beta <= 1:
+            raise UserError(f"beta={beta} is outside (0, 1]: give a value such as 1.0.")
+        if len(in_keys) != 3 or len(out_keys) != 1:
+            raise UserError(
+                "a generative reward has three in_keys (observation, action, next observation) "
+                f"and one out_key, not {list(in_keys)} and {list(out_keys)}."
+            )
+        self.in_keys: list[NestedKey] = list(in_keys)
+        self.out_keys: list[NestedKey] = list(out_keys)
+        self.encoder = encoder
+        self.decoder = decoder
+        self.prior_network = prior_network
+        self.scaler = scaler
+        self.actions = actions
+        self.beta = beta
+        self.scale = scale
+        self._generator = torch.Generator().manual_seed(seed)
+
+    @classmethod
+    def for_vectors(
+        cls,
+        observation_dim: int,
+        action_spec: TensorSpec,
+        *,
+        hidden: Sequence[int] = (100, 100),
+        beta: float = 1.0,
+        scale: float = 1.0,
+        prior: Prior = "standard",
+        normalise: ScalingRule = "standardise",
+        clamp: bool = True,
+        seed: int = 0,
+        in_keys: Sequence[NestedKey] = IN_KEYS,
+        out_keys: Sequence[NestedKey] = OUT_KEYS,
+    ) -> GenerativeReward:
+        """The paper's bodies for vector observations, initialised from ``seed`` alone.
+
+        Args:
+            observation_dim: size of the observation.
+            action_spec: the environment's action spec; z has its size.
+            hidden: hidden layers (tanh) of encoder, decoder and conditional prior.
+            beta: weight of the true action, in (0, 1].
+            scale: lambda.
+            prior: ``"standard"`` for N(0, I), as the released code has it, or ``"conditional"``
+                for the p(z | s) of eq. 1.
+            normalise: the scaler's rule.
+            clamp: compare states clamped to [-1, 1].
+            seed: seed of weights and noise. The global random state is neither read nor changed.
+            in_keys: keys of observation, action and next observation.
+            out_keys: where the reward is written, one key.
+
+        Raises:
+            UserError: for a beta outside (0, 1], or an unknown prior, rule or kind of action.
+        """
+        if prior not in get_args(Prior):
+            raise UserError(f"prior={prior!r} is unknown: choose standard or conditional.")
+        actions = ActionEncoder(action_spec)
+        d, k = observation_dim, actions.size
+        with torch.random.fork_rng(devices=[]):
+            torch.default_generator.manual_seed(seed)
+            encoder, decoder = mlp(2 * d, 2 * k, hidden), mlp(k + d, d, hidden)
+            prior_network = mlp(d, 2 * k, hidden) if prior == "conditional" else None
+        return cls(
+            encoder,
+            decoder,
+            scaler=ObservationScaler(d, rule=normalise, clamp=clamp),
+            actions=actions,
+            prior_network=prior_network,
+            beta=beta,
+            scale=scale,
+            seed=seed,
+            in_keys=in_keys,
+            out_keys=out_keys,
+        )
+
+    def encode(self, observation: Tensor, next_observation: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean and log-variance of ``q(z | s, s')``, for scaled observations."""
+        mu, logvar = self.encoder(torch.cat((observation, next_observation), -1)).chunk(2, -1)
+        return mu, logvar
+
+    def decode(self, action_code: Tensor, observation: Tensor) -> Tensor:
+        """The predicted next observation, scaled but not clamped, for a scaled observation."""
+        return self.decoder(torch.cat((action_code, observation), -1))
+
+    def prior(self, observation: Tensor) -> tuple[Tensor | None, Tensor | None]:
+        """Mean and log-variance of ``p(z | s)`` for a scaled observation; None, None if N(0, I)."""
+        if self.prior_network is None:
+            return None, None
+        mu, logvar = self.prior_network(observation).chunk(2, -1)
+        return mu, logvar
+
+    @dispatch(auto_batch_size=False)
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes each transition's reward."""
+        observation, action, following = (tensordict.get(key) for key in self.in_keys)
+        observation, following = self.scaler(observation), self.scaler(following)
+        code = self.actions(action)
+        if self.beta < 1:
+            code = blend_action(code, self._encoded_action(observation, following), self.beta)
+        predicted = self.decode(code, observation)
+        if self.scaler.clamp:
+            predicted = predicted.clamp(-1.0, 1.0)
+        reward = self.scale * reconstruction_error(predicted, following)
+        return tensordict.set(self.out_keys[0], reward.unsqueeze(-1))
+
+    def _encoded_action(self, observation: Tensor, following: Tensor) -> Tensor:
+        mu, logvar = self.encode(observation, following)
+        # Drawn on the CPU, so that a seed means the same on every device.
+        noise = torch.randn(mu.shape, generator=self._generator, dtype=mu.dtype).to(mu.device)
+        z = mu + (0.5 * logvar).exp() * noise
+        return z.softmax(-1) if self.actions.discrete else z
+
+    def get_extra_state(self) -> Tensor:
+        """The noise generator's state, uint8."""
+        return self._generator.get_state()
+
+    def set_extra_state(self, state: Tensor) -> None:
+        """Restores the noise generator."""
+        self._generator.set_state(state.cpu())

@@ -1,0 +1,77 @@
+"""The leaves of a config dataclass: every dotted key with its type, help and limits."""
+
+from __future__ import annotations
+
+import types
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, fields, is_dataclass
+from typing import Any, Union, get_args, get_origin, get_type_hints
+
+_WORDS = {int: "a whole number", float: "a number", bool: "true or false", str: "text"}
+_LISTS = {
+    int: "a list of whole numbers such as [100,100]",
+    float: "a list of numbers such as [0.5,1.0]",
+    str: "a list of words such as [a,b]",
+}
+
+
+@dataclass(frozen=True)
+class Leaf:
+    """One knob of a recipe."""
+
+    key: str
+    type: Any
+    metadata: Mapping[str, Any]
+
+    @property
+    def help(self) -> str:
+        """The line that ``--help`` shows."""
+        return self.metadata.get("help", "")
+
+    @property
+    def choices(self) -> tuple[str, ...] | None:
+        """The only texts allowed, None where any is."""
+        return self.metadata.get("choices")
+
+    @property
+    def optional(self) -> bool:
+        """Whether the knob may be null."""
+        return type(None) in get_args(self.type)
+
+    @property
+    def needed(self) -> str:
+        """What a value must be, in words.
+
+        Examples:
+            >>> Leaf("seed", int | None, {}).needed
+            'a whole number or null'
+        """
+        kind = self.type
+        if get_origin(kind) in (Union, types.UnionType):
+            kind = next(arg for arg in get_args(kind) if arg is not type(None))
+        if get_origin(kind) is list:
+            words = _LISTS.get(get_args(kind)[0], "a list")
+        else:
+            words = _WORDS.get(kind, getattr(kind, "__name__", str(kind)))
+        return words + (" or null" if self.optional else "")
+
+
+def leaves(config: type[Any], prefix: str = "") -> Iterator[Leaf]:
+    """Walk a config dataclass and its parts in the order in which they are written.
+
+    Args:
+        config: a dataclass, its parts dataclasses too.
+        prefix: dotted key of ``config`` itself, with the dot.
+
+    Examples:
+        >>> from giril_rl.configs import RunConfig
+        >>> [leaf.key for leaf in leaves(RunConfig)][:2]
+        ['task.name', 'task.env_id']
+    """
+    hints = get_type_hints(config)
+    for part in fields(config):
+        kind = hints[part.name]
+        if is_dataclass(kind):
+            yield from leaves(kind, f"{prefix}{part.name}.")  # type: ignore[arg-type]
+        else:
+            yield Leaf(f"{prefix}{part.name}", kind, part.metadata)

@@ -1,0 +1,104 @@
+"""The true score of a policy, on fresh environments and whole episodes."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+
+import torch
+from torch import Tensor
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from giril_rl.configs import TaskConfig
+from giril_rl.envs import make_env
+from giril_rl.networks.policy import ActorCritic
+
+
+@dataclass
+class Scores:
+    """Undiscounted true returns over whole episodes."""
+
+    return_mean: float
+    return_std: float
+    return_median: float
+    episode_length_mean: float
+    episodes: int
+    returns: list[float]
+
+    def as_dict(self) -> dict[str, object]:
+        """Plain JSON values."""
+        return asdict(self)
+
+
+def evaluate(
+    agent: ActorCritic,
+    task: TaskConfig,
+    *,
+    episodes: int,
+    seed: int,
+    deterministic: bool,
+) -> Scores:
+    """Plays each of ``episodes`` fresh environments for exactly one episode.
+
+    One episode per environment, whatever its length: counting the first ones to end would favour
+    short episodes. Torch's random state is put back afterwards.
+
+    Args:
+        agent: the policy; its running normalisation is used as it is and not updated.
+        task: the task to play.
+        episodes: number of episodes.
+        seed: root of the episodes' seeds and seed of the sampled actions.
+        deterministic: play the distribution's mode rather than samples.
+
+    Returns:
+        The scores; the standard deviation is the sample's (n - 1), 0 for one episode.
+
+    Examples:
+        >>> task = TaskConfig(name="cartpole", env_id="CartPole-v1")
+        >>> env = make_env(task, num_envs=1, seed=0)
+        >>> scores = evaluate(
+        ...     ActorCritic(4, env.action_spec), task, episodes=5, seed=0, deterministic=True
+        ... )
+        >>> scores.episodes, scores.return_mean == scores.episode_length_mean
+        (5, True)
+    """
+    env = make_env(task, episodes, seed)
+    policy = agent.acting()
+    mode = ExplorationType.DETERMINISTIC if deterministic else ExplorationType.RANDOM
+    returns = torch.zeros(episodes, dtype=torch.float64)
+    lengths = torch.zeros(episodes, dtype=torch.int64)
+    playing = torch.ones(episodes, dtype=torch.bool)
+    with torch.random.fork_rng(devices=[]), torch.no_grad(), set_exploration_type(mode):
+        torch.default_generator.manual_seed(seed)
+        tensordict = env.reset()
+        while playing.any():
+            tensordict, following = env.step_and_maybe_reset(policy(tensordict))
+            reward: Tensor = tensordict.get(("next", "reward")).squeeze(-1)
+            returns[playing] += reward[playing].double()
+            lengths += playing
+            playing &= ~tensordict.get(("next", "done")).squeeze(-1)
+            tensordict = following
+    env.close()
+    return Scores(
+        return_mean=returns.mean().item(),
+        return_std=returns.std().item() if episodes > 1 else 0.0,
+        return_median=returns.quantile(0.5).item(),
+        episode_length_mean=lengths.double().mean().item(),
+        episodes=episodes,
+        returns=returns.tolist(),
+    )
+
+
+def evaluate_both(
+    agent: ActorCritic, task: TaskConfig, *, episodes: int, seed: int
+) -> dict[str, object]:
+    """Scores of the deterministic policy, and of the sampled one under ``"sampled"``.
+
+    The entries are those of :class:`Scores`; the first ones are what tables quote.
+    """
+    scores = {
+        deterministic: evaluate(
+            agent, task, episodes=episodes, seed=seed, deterministic=deterministic
+        )
+        for deterministic in (True, False)
+    }
+    return {**scores[True].as_dict(), "sampled": scores[False].as_dict()}

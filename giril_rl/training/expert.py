@@ -1,0 +1,181 @@
+"""The player and its demonstration: made once, then shared by all runs that ask for the same."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import sys
+from collections.abc import Iterator
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import torch
+from filelock import FileLock, Timeout
+from tensordict import TensorDict
+from torch import Tensor
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from giril_rl.configs import DemoConfig, ExpertConfig, ExpertRunConfig, RunConfig, TaskConfig
+from giril_rl.demos import Demonstration, check_demonstration, record_demonstration
+from giril_rl.envs import gym_factory, make_env
+from giril_rl.errors import UserError
+from giril_rl.naming import config_hash, safe
+from giril_rl.networks.policy import ActorCritic
+from giril_rl.training.agent import load_agent, make_agent, save_agent
+from giril_rl.training.ppo import train_ppo
+from giril_rl.training.finished import read_result, read_settings
+from giril_rl.training.result import finish_run
+from giril_rl.training.run import Run
+from giril_rl.transforms import ReturnScaling
+
+
+def expert_folder(cfg: ExpertRunConfig) -> Path:
+    """Where an expert of these settings is kept: ``root/expert/task/hash``.
+
+    Examples:
+        >>> task = TaskConfig(name="cartpole", env_id="CartPole-v1")
+        >>> expert_folder(ExpertRunConfig(task=task)).parent.as_posix()
+        'runs/expert/cartpole'
+    """
+    return Path(cfg.root) / "expert" / safe(cfg.task.name) / config_hash(cfg)
+
+
+def train_expert(cfg: ExpertRunConfig, folder: Path) -> dict[str, Any]:
+    """Trains PPO on the true reward and scores it, or returns what an earlier run left.
+
+    Args:
+        cfg: the expert's settings.
+        folder: the run's folder.
+
+    Returns:
+        The contents of ``result.json``.
+
+    Raises:
+        Interrupted: after a checkpoint, if the user asked for it with Ctrl-C.
+    """
+    with Run.open(folder, asdict(cfg), recipe="expert", logger=cfg.logger) as run:
+        if run.result is not None:
+            return run.result
+        env = make_env(cfg.task, cfg.ppo.num_envs, cfg.seed)
+        agent = make_agent(env, cfg.ppo, cfg.seed)
+        relabel: Any = torch.nn.Identity()
+        if cfg.scaling.enabled:
+            relabel = ReturnScaling(
+                cfg.ppo.gamma,
+                reset=cfg.scaling.reset,  # type: ignore[arg-type]
+                clip=cfg.scaling.clip,
+            )
+        trained = train_ppo(
+            env,
+            agent,
+            relabel,
+            cfg.ppo,
+            steps=cfg.steps,
+            seed=cfg.seed,
+            run=run,
+            stop_at=cfg.task.expert_score if cfg.stop_early else None,
+        )
+        env.close()
+        return finish_run(run, cfg, agent, trained, method="expert")
+
+
+def obtain_expert(cfg: RunConfig, expert: ExpertConfig) -> tuple[Path, dict[str, Any]]:
+    """The folder and result of the expert that a recipe asks for, trained first if need be.
+
+    Args:
+        cfg: the recipe's settings, of which task, root and evaluation are shared.
+        expert: the expert's own.
+
+    Raises:
+        UserError: if ``expert.path`` is no finished run of this task.
+    """
+    if expert.path is not None:
+        folder = Path(expert.path)
+        result = read_result(folder)
+        if result["task"] != cfg.task.name:
+            raise UserError(
+                f"expert.path={folder} plays {result['task']}, not {cfg.task.name}: "
+                "choose an expert of the same task."
+            )
+        return folder, result
+    settings = ExpertRunConfig(
+        task=cfg.task,
+        root=cfg.root,
+        logger=cfg.logger,
+        threads=cfg.threads,
+        steps=expert.steps,
+        seed=expert.seed,
+        stop_early=expert.stop_early,
+    )
+    folder = expert_folder(settings)
+    with made_once(folder, "expert"):
+        return folder, train_expert(settings, folder)
+
+
+def obtain_demonstration(
+    cfg: RunConfig, expert: ExpertConfig, demo: DemoConfig
+) -> tuple[Demonstration, dict[str, Any] | None]:
+    """The demonstration that a recipe asks for, recorded first if need be, and its expert's result.
+
+    The latter is None for a demonstration that was given by its path.
+
+    Raises:
+        UserError: if the demonstration does not fit the task.
+    """
+    env = make_env(cfg.task, 1, seed=0)
+    shape, spec = env.observation_spec["observation"].shape, env.action_spec
+    env.close()
+    if demo.path is not None:
+        found = Demonstration.load(demo.path)
+        check_demonstration(found, shape[-1], spec)
+        return found, None
+    source, result = obtain_expert(cfg, expert)
+    settings = {k: v for k, v in asdict(demo).items() if k not in ("path", "subsample")}
+    identity = json.dumps([settings, asdict(cfg.task), result["config_hash"]], sort_keys=True)
+    digest = hashlib.sha256(identity.encode()).hexdigest()[:12]
+    folder = Path(cfg.root) / "demos" / safe(cfg.task.name) / digest
+    with made_once(folder, "demonstration"):
+        if not folder.exists():
+            agent = load_agent(source, cfg.task, read_settings(source)[1])
+            recorded = record_demonstration(
+                gym_factory(cfg.task),
+                _player(agent, deterministic=demo.deterministic),
+                seed=demo.seed,
+                length=demo.length,
+                episodes=demo.episodes,
+                deterministic=demo.deterministic,
+                task=cfg.task.name,
+                expert={"return_mean": result["return_mean"], "seed": result["seed"]},
+            )
+            recorded.save(folder)
+    return Demonstration.load(folder), result
+
+
+def _player(agent: ActorCritic, *, deterministic: bool) -> Any:
+    policy = agent.acting()
+    mode = ExplorationType.DETERMINISTIC if deterministic else ExplorationType.RANDOM
+
+    def play(observation: Tensor) -> Tensor:
+        with set_exploration_type(mode):
+            batch = TensorDict({"observation": observation}, observation.shape[:1])
+            return policy(batch)["action"]
+
+    return play
+
+
+@contextlib.contextmanager
+def made_once(folder: Path, what: str) -> Iterator[None]:
+    """Lets one process make ``folder`` while others that want it wait."""
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    lock = FileLock(str(folder.parent / f".{folder.name}.lock"))
+    try:
+        lock.acquire(timeout=0)
+    except Timeout:
+        print(f"waiting for another run that is making the {what} {folder}", file=sys.stderr)
+        lock.acquire()
+    try:
+        yield
+    finally:
+        lock.release()

@@ -1,0 +1,93 @@
+"""Reading what a run left behind."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from pathlib import Path
+from typing import Any, TypeVar
+
+import yaml
+
+from giril_rl.configs import EvalConfig, PPOConfig, TaskConfig
+from giril_rl.errors import UserError
+from giril_rl.files import read_json, write_json
+from giril_rl.training.agent import load_agent
+from giril_rl.training.evaluate import evaluate_both
+
+Part = TypeVar("Part")
+
+
+def read_result(folder: Path) -> dict[str, Any]:
+    """A finished run's ``result.json``.
+
+    Raises:
+        UserError: if the folder holds no finished run.
+    """
+    path = folder / "result.json"
+    if not path.exists():
+        raise UserError(f"{folder} holds no finished run (no result.json): run it to its end first.")
+    return read_json(path)
+
+
+def read_settings(folder: Path) -> tuple[TaskConfig, PPOConfig, EvalConfig]:
+    """A run's task, policy and evaluation settings, from its ``config.yaml``.
+
+    Raises:
+        UserError: if the file is missing or is not what a run writes.
+    """
+    path = folder / "config.yaml"
+    try:
+        config = yaml.safe_load(path.read_text(encoding="utf-8"))
+        return (
+            _part(TaskConfig, config["task"]),
+            _part(PPOConfig, config["ppo"]),
+            _part(EvalConfig, config["eval"]),
+        )
+    except (OSError, ValueError, KeyError, TypeError, yaml.YAMLError):
+        raise UserError(f"{folder} is not a run's folder (no readable config.yaml).") from None
+
+
+def evaluate_run(folder: Path, episodes: int | None = None, seed: int | None = None) -> None:
+    """Scores a finished run's policy again and prints the scores; ``eval.json`` keeps them.
+
+    ``result.json`` stays as it is.
+
+    Args:
+        folder: the run's folder.
+        episodes: episodes of each kind; None takes the run's own setting.
+        seed: root of the episodes' seeds; None takes the run's own setting.
+
+    Raises:
+        UserError: if the folder holds no finished run.
+    """
+    read_result(folder)
+    task, ppo, settings = read_settings(folder)
+    agent = load_agent(folder, task, ppo)
+    episodes = settings.episodes if episodes is None else episodes
+    seed = settings.seed if seed is None else seed
+    scores = evaluate_both(agent, task, episodes=episodes, seed=seed)
+    write_json(folder / "eval.json", {"task": task.name, "eval_seed": seed, **scores})
+    print(f"{task.name}, {episodes} episodes each, evaluation seed {seed}")
+    print(describe("deterministic", scores))
+    print(describe("sampled", scores["sampled"]))  # type: ignore[arg-type]
+
+
+def describe(kind: str, scores: dict[str, Any]) -> str:
+    """One line of a score table.
+
+    Examples:
+        >>> describe("sampled", {
+        ...     "return_mean": 1000.0, "return_std": 0.0, "return_median": 1000.0,
+        ...     "episode_length_mean": 1000.0,
+        ... })
+        'sampled        return 1,000.0 ± 0.0 (median 1,000.0), length 1,000.0'
+    """
+    return (
+        f"{kind:<14} return {scores['return_mean']:,.1f} ± {scores['return_std']:,.1f} "
+        f"(median {scores['return_median']:,.1f}), length {scores['episode_length_mean']:,.1f}"
+    )
+
+
+def _part(kind: type[Part], values: dict[str, Any]) -> Part:
+    names = {f.name for f in fields(kind)}  # type: ignore[arg-type]
+    return kind(**{key: value for key, value in values.items() if key in names})

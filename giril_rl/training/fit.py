@@ -1,0 +1,103 @@
+"""Fitting a reward model to a demonstration, before the policy's training (Algorithm 1)."""
+
+from __future__ import annotations
+
+import time
+from typing import TYPE_CHECKING
+
+import torch
+from tensordict import TensorDictBase
+from torch import nn
+from torchrl.objectives import LossModule
+
+from giril_rl.configs import FitConfig
+from giril_rl.progress import progress
+from giril_rl.training.interrupt import Interrupt, Interrupted
+from giril_rl.training.traced import TracedGradients
+
+if TYPE_CHECKING:
+    from giril_rl.training.run import Run
+
+CHECKPOINT_EVERY = 5_000
+
+
+def fit_reward(
+    loss: LossModule,
+    data: TensorDictBase,
+    cfg: FitConfig,
+    *,
+    seed: int,
+    run: Run,
+    held_out: TensorDictBase | None = None,
+    phase: str = "fit",
+) -> float:
+    """Minimises ``loss`` on random minibatches of ``data`` with Adam; resumes by itself.
+
+    Args:
+        loss: the reward model's loss; its modules are trained in place.
+        data: transitions to fit, batch ``(n,)``, with the loss's ``in_keys``.
+        cfg: steps, batch size and step size.
+        seed: seeds minibatches and the loss's own noise.
+        run: where metrics and checkpoints go.
+        held_out: transitions that the losses are logged on besides, never fitted.
+        phase: name of the checkpoint and of the metrics.
+
+    Returns:
+        Seconds of fitting, those of earlier processes included.
+
+    Raises:
+        Interrupted: after a checkpoint, if the user asked for it with Ctrl-C.
+    """
+    keys = loss.in_keys
+    gradients = TracedGradients(loss, keys=keys)
+    optimizer = torch.optim.Adam(gradients.parameters, lr=cfg.lr, fused=True)
+    columns = [data.get(key).contiguous() for key in keys]
+    generator = torch.Generator().manual_seed(seed)
+    torch.manual_seed(seed)
+    step, seconds = 0, 0.0
+    saved = run.load(phase)
+    if saved is not None:
+        step, seconds = saved["step"], saved["seconds"]
+        loss.load_state_dict(saved["loss"])
+        optimizer.load_state_dict(saved["optimizer"])
+        generator.set_state(saved["minibatches"])
+        torch.set_rng_state(saved["rng"])
+        run.truncate_metrics(phase, step)
+    began = time.perf_counter() - seconds
+    with Interrupt() as interrupt, progress(cfg.steps, step, "reward model") as bar:
+        while step < cfg.steps:
+            block = min(cfg.log_every - step % cfg.log_every, cfg.steps - step)
+            indices = torch.randint(len(data), (block, cfg.batch), generator=generator)
+            for index in indices:
+                gradients.step([column[index] for column in columns])
+                optimizer.step()
+            step += block
+            bar.update(block)
+            run.log(step, _evaluate(loss, {"fitted": data, "held_out": held_out}), phase=phase)
+            if step % CHECKPOINT_EVERY < block or step == cfg.steps or interrupt.requested:
+                state = {
+                    "step": step,
+                    "seconds": time.perf_counter() - began,
+                    "loss": dict(loss.state_dict()),
+                    "optimizer": optimizer.state_dict(),
+                    "minibatches": generator.get_state(),
+                    "rng": torch.get_rng_state(),
+                }
+                run.save(phase, state)
+            if interrupt.requested and step < cfg.steps:
+                raise Interrupted.at(step, cfg.steps, "fitting steps")
+    return time.perf_counter() - began if saved is None or step > saved["step"] else seconds
+
+
+def _evaluate(loss: nn.Module, sets: dict[str, TensorDictBase | None]) -> dict[str, float]:
+    """The loss's terms on whole sets, with noise that leaves the run's random numbers alone."""
+    values: dict[str, float] = {}
+    for name, data in sets.items():
+        if data is None or not len(data):
+            continue
+        with torch.no_grad(), torch.random.fork_rng(devices=[]):
+            torch.default_generator.manual_seed(0)
+            for key, value in loss(data).items():
+                values[f"fit/{name}/{str(key).removeprefix('loss_')}"] = value.item()
+    return values
+

@@ -1,0 +1,118 @@
+"""A run's measurements: one JSON object a line, as they come."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import math
+import zlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+from giril_rl.errors import UserError
+from giril_rl.files import write_atomically
+
+LoggerName = Literal["tensorboard", "csv", "wandb", "mlflow"]
+
+
+def read_metrics(path: Path) -> list[dict[str, Any]]:
+    r"""The rows of a ``metrics.jsonl``, oldest first; a line that a kill cut short is left out.
+
+    Examples:
+        >>> import tempfile
+        >>> path = Path(tempfile.mkdtemp()) / "metrics.jsonl"
+        >>> _ = path.write_text('{"phase": "ppo", "step": 512, "ppo/loss": 0.5}\n{"phase": "pp')
+        >>> read_metrics(path)
+        [{'phase': 'ppo', 'step': 512, 'ppo/loss': 0.5}]
+    """
+    if not path.exists():
+        return []
+    rows = []
+    for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
+        try:
+            row = json.loads(line)
+        except ValueError:
+            continue
+        if isinstance(row, dict):
+            rows.append(row)
+    return rows
+
+
+class MetricsFile:
+    """Appends rows to ``metrics.jsonl``; each is on disk when :meth:`write` returns.
+
+    Examples:
+        >>> import tempfile
+        >>> metrics = MetricsFile(Path(tempfile.mkdtemp()) / "metrics.jsonl")
+        >>> metrics.write("ppo", 512, {"ppo/loss": 0.5})
+        >>> metrics.write("ppo", 1024, {"ppo/loss": float("nan")})
+        >>> metrics.truncate("ppo", 512)
+        >>> read_metrics(metrics.path)
+        [{'phase': 'ppo', 'step': 512, 'ppo/loss': 0.5}]
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        if path.exists() and not path.read_bytes().endswith(b"\n"):
+            self._rewrite(read_metrics(path))
+
+    def write(self, phase: str, step: int, values: Mapping[str, float]) -> None:
+        """Append one row. JSON has no NaN or infinity: they become null."""
+        row: dict[str, Any] = {"phase": phase, "step": int(step)}
+        for key, value in values.items():
+            number = float(value)
+            row[key] = number if math.isfinite(number) else None
+        with open(self.path, "a", encoding="utf-8") as file:
+            file.write(json.dumps(row) + "\n")
+
+    def truncate(self, phase: str, step: int) -> None:
+        """Drop the rows of ``phase`` later than ``step``, and a line that a kill cut short."""
+        if self.path.exists():
+            rows = read_metrics(self.path)
+            self._rewrite([r for r in rows if r.get("phase") != phase or r["step"] <= step])
+
+    def _rewrite(self, rows: list[dict[str, Any]]) -> None:
+        write_atomically(self.path, "".join(json.dumps(row) + "\n" for row in rows))
+
+
+def check_logger(name: str | None) -> None:
+    """Refuse an unknown logger, or one whose package is missing, before any work is done.
+
+    Raises:
+        UserError: naming the choices, or what to install.
+
+    Examples:
+        >>> check_logger("paper")
+        Traceback (most recent call last):
+        ...
+        giril_rl.errors.UserError: logger=paper is unknown: choose tensorboard, csv, wandb, ...
+    """
+    if name is None:
+        return
+    if name not in get_args(LoggerName):
+        choices = ", ".join(get_args(LoggerName))
+        raise UserError(f"logger={name} is unknown: choose {choices} or null.")
+    if name != "csv" and importlib.util.find_spec(name) is None:
+        raise UserError(
+            f'logger={name} needs the package {name}: pip install "giril-rl[loggers]", '
+            "or choose logger=csv or logger=null."
+        )
+
+
+def make_logger(name: LoggerName, folder: Path) -> Any:
+    """The TorchRL logger ``name`` (``torchrl.record.loggers``) that writes under ``folder``.
+
+    TensorBoard files are in ``folder/tensorboard``, CSV files in ``folder/csv``; Weights & Biases
+    and MLflow name the run after the folder.
+    """
+    check_logger(name)
+    from torchrl.record.loggers.utils import get_logger
+
+    if name in ("tensorboard", "csv"):
+        return get_logger(name, str(folder / name), "")
+    # A resumed run continues the same W&B run, whose id is made of the folder's path.
+    place = folder.resolve()
+    identity = f"{place.name}-{zlib.crc32(str(place).encode()):08x}"
+    wandb_kwargs = {"project": "giril_rl", "id": identity, "resume": "allow"}
+    return get_logger(name, str(folder / name), folder.name, wandb_kwargs=wandb_kwargs)

@@ -1,0 +1,224 @@
+"""The one loop that every recipe trains its policy with: PPO on whatever reward it is given."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+from tensordict import TensorDictBase
+from torch import nn
+from torchrl.collectors import Collector
+from torchrl.objectives import ClipPPOLoss
+from torchrl.objectives.value import GAE
+
+from giril_rl.configs import PPOConfig
+from giril_rl.envs.vector import GymVectorEnv
+from giril_rl.networks.policy import NORMALISED, ActorCritic
+from giril_rl.training.episodes import EpisodeTracker
+from giril_rl.training.interrupt import Interrupt, Interrupted
+from giril_rl.progress import progress
+from giril_rl.training.traced import TracedGradients
+
+if TYPE_CHECKING:
+    from giril_rl.training.run import Run
+
+LEARNER_KEYS = (
+    NORMALISED,
+    "action",
+    "action_log_prob",
+    "advantage",
+    "value_target",
+)
+
+
+class Trained(NamedTuple):
+    """How long a training was."""
+
+    steps: int
+    seconds: float
+
+
+def train_ppo(
+    env: GymVectorEnv,
+    agent: ActorCritic,
+    relabel: Callable[[TensorDictBase], TensorDictBase],
+    cfg: PPOConfig,
+    *,
+    steps: int,
+    seed: int,
+    run: Run,
+    phase: str = "ppo",
+    stop_at: float | None = None,
+) -> Trained:
+    """Trains ``agent`` in place on the reward that ``relabel`` writes; resumes by itself.
+
+    The environment's own reward is read for the log, before ``relabel`` replaces it, and by
+    nothing that reaches the learner. Checkpoints hold everything that the rest of the run depends
+    on, the simulators' state included, so that an interrupted run ends with the same weights.
+
+    Args:
+        env: the training environments.
+        agent: policy and value network.
+        relabel: a transform or a composition of them, called with each batch ``(num_envs, time)``;
+            whatever it holds in its ``state_dict`` is checkpointed.
+        cfg: settings of PPO.
+        steps: environment steps in all, a multiple of ``cfg.num_envs * cfg.rollout``.
+        seed: seeds action sampling and minibatch order.
+        run: where metrics and checkpoints go.
+        phase: name of the checkpoint and of the metrics.
+        stop_at: ends training once the mean true return of the last 20 training episodes reaches
+            this. Only an expert, which may see the true reward, is trained with it.
+
+    Returns:
+        Environment steps and seconds, those of earlier processes included.
+
+    Raises:
+        Interrupted: after a checkpoint, if the user asked for it with Ctrl-C.
+    """
+    learner = PPOLearner(agent, cfg, total_steps=steps)
+    tracker = EpisodeTracker(cfg.num_envs)
+    recent: deque[float] = deque(maxlen=20)
+    parts = nn.ModuleDict({"agent": agent, "tracker": tracker})
+    if isinstance(relabel, nn.Module):
+        parts["relabel"] = relabel
+    taken = 0
+    saved = run.load(phase)
+    if saved is not None:
+        taken = saved["steps"]
+        recent.extend(saved["recent"])
+    if saved is not None and (taken >= steps or saved["stopped"]):
+        parts.load_state_dict(saved["parts"])
+        return Trained(taken, saved["seconds"])
+    if saved is not None:
+        env.restore_simulator(saved["simulator"])
+    batch_size = cfg.num_envs * cfg.rollout
+    collector = Collector(
+        env,
+        agent.acting(),
+        frames_per_batch=batch_size,
+        total_frames=steps - taken,
+        track_traj_ids=False,
+        trust_policy=True,
+        auto_register_policy_transforms=False,
+    )
+    # Only now, for making a collector may draw random numbers.
+    torch.manual_seed(seed)
+    if saved is not None:
+        parts.load_state_dict(saved["parts"])
+        learner.optimizer.load_state_dict(saved["optimizer"])
+        torch.set_rng_state(saved["rng"])
+        run.truncate_metrics(phase, taken)
+    next_save = (taken // cfg.checkpoint_every + 1) * cfg.checkpoint_every
+    stopped = False
+    true_return = "?"
+    began = time.perf_counter() - (0.0 if saved is None else saved["seconds"])
+
+    with Interrupt() as interrupt, progress(steps, taken, phase) as bar:
+        for batch in collector:
+            started = time.perf_counter()
+            returns, lengths = tracker(batch)
+            recent.extend(returns.tolist())
+            losses = learner.learn(relabel(batch), taken)
+            taken += batch_size
+            metrics = {f"{phase}/{k}": v for k, v in losses.items()}
+            metrics[f"{phase}/update_seconds"] = time.perf_counter() - started
+            metrics[f"{phase}/reward_mean"] = batch.get(("next", "reward")).mean().item()
+            metrics["train/episodes"] = float(len(returns))
+            if len(returns):
+                metrics["train/return_mean"] = returns.mean().item()
+                metrics["train/length_mean"] = lengths.double().mean().item()
+                true_return = f"{metrics['train/return_mean']:,.1f}"
+            bar.update(batch_size, true_return=true_return)
+            run.log(taken, metrics, phase=phase)
+            if stop_at is not None and len(recent) == recent.maxlen:
+                stopped = sum(recent) / len(recent) >= stop_at
+            if taken >= next_save or taken >= steps or stopped or interrupt.requested:
+                next_save += cfg.checkpoint_every
+                state = {
+                    "steps": taken,
+                    "seconds": time.perf_counter() - began,
+                    "stopped": stopped,
+                    "recent": list(recent),
+                    "parts": dict(parts.state_dict()),
+                    "optimizer": learner.optimizer.state_dict(),
+                    "simulator": env.simulator_state(),
+                    "rng": torch.get_rng_state(),
+                }
+                run.save(phase, state)
+            if stopped:
+                break
+            if interrupt.requested and taken < steps:
+                collector.shutdown(close_env=False)
+                raise Interrupted.at(taken, steps)
+    collector.shutdown(close_env=False)
+    return Trained(taken, time.perf_counter() - began)
+
+
+class PPOLearner:
+    """One PPO update: advantages, then epochs of minibatches, on TorchRL's GAE and ClipPPOLoss.
+
+    Args:
+        agent: policy and value network.
+        cfg: settings of PPO.
+        total_steps: environment steps of the whole training, for a decreasing step size.
+    """
+
+    def __init__(self, agent: ActorCritic, cfg: PPOConfig, *, total_steps: int) -> None:
+        self.agent = agent
+        self.cfg = cfg
+        self.total_steps = total_steps
+        critic = agent.critic_for_loss()
+        self.advantage = GAE(gamma=cfg.gamma, lmbda=cfg.lmbda, value_network=critic)
+        loss = ClipPPOLoss(
+            agent.actor_for_loss(),
+            critic,
+            clip_epsilon=cfg.clip,
+            entropy_bonus=cfg.entropy_coef > 0,
+            entropy_coeff=cfg.entropy_coef,
+            critic_coeff=cfg.value_coef,
+            loss_critic_type="l2",
+            normalize_advantage=True,
+            log_explained_variance=False,
+            functional=False,
+        )
+        self.gradients = TracedGradients(
+            loss,
+            keys=LEARNER_KEYS,
+            log=("kl_approx", "clip_fraction"),
+            max_grad_norm=cfg.max_grad_norm,
+        )
+        # The implementation that updates all parameters in one call.
+        self.optimizer = torch.optim.Adam(
+            self.gradients.parameters, lr=cfg.lr, eps=1e-5, fused=True
+        )
+
+    def learn(self, batch: TensorDictBase, taken: int) -> dict[str, float]:
+        """Updates the agent on a relabelled batch ``(num_envs, time)``.
+
+        Args:
+            batch: what the acting policy collected, with the reward to learn from.
+            taken: environment steps before this batch.
+
+        Returns:
+            Means over the update's last epoch.
+        """
+        cfg = self.cfg
+        if cfg.anneal_lr:
+            for group in self.optimizer.param_groups:
+                group["lr"] = cfg.lr * (1 - taken / self.total_steps)
+        with torch.no_grad():
+            following = self.agent.normaliser(batch.get(("next", "observation")))
+            batch.set(("next", NORMALISED), following)
+            self.advantage(batch)
+        flat = [batch.get(key).flatten(0, 1) for key in LEARNER_KEYS]
+        for _ in range(cfg.epochs):
+            logs: list[dict[str, torch.Tensor]] = []
+            order = torch.randperm(batch.numel())
+            for minibatch in zip(*(x[order].split(cfg.minibatch) for x in flat), strict=True):
+                logs.append(self.gradients.step(minibatch))
+                self.optimizer.step()
+        self.agent.update_normaliser(batch.get("observation"))
+        return {k: torch.stack([log[k] for log in logs]).mean().item() for k in logs[0]}

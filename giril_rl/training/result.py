@@ -1,0 +1,78 @@
+"""The end of a run: scores, the learning curve and ``result.json``."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime
+from typing import Any
+
+from giril_rl.configs import RunConfig
+from giril_rl.demos import Demonstration
+from giril_rl.naming import config_hash
+from giril_rl.networks.policy import ActorCritic
+from giril_rl.report.curve import write_curve
+from giril_rl.training.agent import save_agent
+from giril_rl.training.evaluate import evaluate_both
+from giril_rl.training.metrics import read_metrics
+from giril_rl.training.ppo import Trained
+from giril_rl.training.run import Run
+
+
+def finish_run(
+    run: Run,
+    cfg: RunConfig,
+    agent: ActorCritic,
+    trained: Trained,
+    *,
+    method: str,
+    expert: dict[str, Any] | None = None,
+    demo: Demonstration | None = None,
+    seeds: dict[str, int] | None = None,
+) -> dict[str, Any]:
+    """Scores the policy on fresh environments and writes policy, curve and ``result.json``.
+
+    Args:
+        run: the run's folder.
+        cfg: the run's settings.
+        agent: the trained policy.
+        trained: its steps and seconds.
+        method: the method's name in tables.
+        expert: the expert's result, if there was one.
+        demo: the demonstration, if there was one.
+        seeds: seeds besides those of policy and evaluation.
+
+    Returns:
+        What ``result.json`` holds.
+    """
+    save_agent(agent, run.folder)
+    scores = evaluate_both(agent, cfg.task, episodes=cfg.eval.episodes, seed=cfg.eval.seed)
+    result: dict[str, Any] = {
+        "method": method,
+        "task": cfg.task.name,
+        "profile": cfg.profile,
+        "seed": cfg.seed,
+        "seeds": {"policy": cfg.seed, "evaluation": cfg.eval.seed, **(seeds or {})},
+        "env_steps": trained.steps,
+        **scores,
+        "wall_seconds": trained.seconds,
+        "steps_per_second": trained.steps / max(trained.seconds, 1e-9),
+        "expert_return_mean": None if expert is None else expert["return_mean"],
+        "demo_return_mean": None if demo is None else demo.returns.mean().item(),
+        "demo_transitions": None if demo is None else len(demo),
+        "config_hash": config_hash(cfg),
+        "versions": run.versions,
+        "finished_at": datetime.now(UTC).isoformat(timespec="seconds"),
+    }
+    write_curve(
+        run.folder,
+        read_metrics(run.folder / "metrics.jsonl"),
+        recipe=method,
+        task=cfg.task.name,
+        seed=cfg.seed,
+        expert_return=result["expert_return_mean"],
+        demo_return=result["demo_return_mean"],
+        final_return=result["return_mean"],
+        final_std=result["return_std"],
+        final_step=trained.steps,
+    )
+    run.finish(result)
+    return result

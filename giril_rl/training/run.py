@@ -1,0 +1,247 @@
+"""A run is a folder: resolved config, versions, metrics as they come, checkpoints, the result."""
+
+from __future__ import annotations
+
+import json
+import warnings
+from collections.abc import Collection, Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import yaml
+from filelock import FileLock, Timeout
+
+from giril_rl.errors import UserError
+from giril_rl.files import installed_versions, read_json, write_atomically, write_json
+from giril_rl.training.checkpoint import load_state, save_state
+from giril_rl.training.metrics import MetricsFile, check_logger, make_logger
+
+IGNORED = frozenset({"out", "root", "logger", "threads"})
+"""Keys that may differ when a run is continued: they change where and how fast, not the numbers."""
+
+
+class Run:
+    """One run's folder, held by one process at a time; made and continued with :meth:`open`.
+
+    ========================  ====================================================================
+    ``config.yaml``           the resolved configuration, with the recipe's name
+    ``versions.json``         Python and the packages that decide the numbers
+    ``metrics.jsonl``         measurements, one JSON object a line
+    ``NAME.safetensors``      checkpoints, see :func:`giril_rl.training.checkpoint.save_state`
+    ``result.json``           written last; where it is, the run is finished
+    ========================  ====================================================================
+
+    Attributes:
+        folder: the folder.
+        recipe: the recipe's name.
+        config: the resolved configuration, as given.
+        versions: what ``versions.json`` holds.
+
+    Examples:
+        >>> import tempfile
+        >>> folder = Path(tempfile.mkdtemp()) / "run"
+        >>> with Run.open(folder, {"seed": 0, "ppo": {"lr": 0.1}}, recipe="giril") as run:
+        ...     state = run.load("ppo") or {"step": 0}
+        ...     run.log(state["step"] + 512, {"ppo/loss": 0.5}, phase="ppo")
+        ...     run.save("ppo", {"step": 512})
+        >>> with Run.open(folder, {"seed": 0, "ppo": {"lr": 0.1}}, recipe="giril") as run:
+        ...     print(run.load("ppo"), run.result)
+        {'step': 512} None
+        >>> Run.open(folder, {"seed": 0, "ppo": {"lr": 0.2}}, recipe="giril")  # doctest: +ELLIPSIS
+        Traceback (most recent call last):
+        ...
+        giril_rl.errors.UserError: ... was made with other settings (ppo.lr: 0.1 there, 0.2 now)...
+    """
+
+    def __init__(self, folder: Path, config: dict[str, Any], recipe: str, logger: str | None):
+        self.folder, self.config, self.recipe = folder, config, recipe
+        self.versions: dict[str, Any] = installed_versions()
+        self._logger_name = logger
+        self._logger: Any = None
+        self._metrics: MetricsFile
+        self._lock = FileLock(str(folder / ".lock"), thread_local=False)
+
+    @classmethod
+    def open(
+        cls,
+        folder: Path | str,
+        config: dict[str, Any],
+        *,
+        recipe: str,
+        logger: str | None = None,
+        ignore: Collection[str] = IGNORED,
+    ) -> Run:
+        """Make a run's folder, or open it again to continue; use the result in a ``with``.
+
+        Args:
+            folder: the folder, made if need be.
+            config: the resolved configuration, of plain dicts, lists and scalars.
+            recipe: the recipe's name, which belongs to the configuration.
+            logger: "tensorboard", "csv", "wandb" or "mlflow", beside ``metrics.jsonl``.
+            ignore: dotted keys that may differ from the ones that the run was made with.
+
+        Raises:
+            UserError: if the folder holds something else, was made with other settings or is in
+                use, or if the logger is unknown or not installed.
+        """
+        check_logger(logger)
+        run = cls(Path(folder), config, recipe, logger)
+        run._refuse_foreign_folder()
+        run.folder.mkdir(parents=True, exist_ok=True)
+        try:
+            run._lock.acquire(blocking=False)
+        except Timeout:
+            raise UserError(
+                f"{run.folder} is in use by another process: wait for it to end, "
+                "or choose another out=."
+            ) from None
+        try:
+            for leftover in run.folder.glob(".*.tmp"):
+                leftover.unlink()
+            run._write_or_compare_config(ignore)
+            run._write_versions()
+            run._metrics = MetricsFile(run.folder / "metrics.jsonl")
+        except BaseException:
+            run.close()
+            raise
+        return run
+
+    def log(self, step: int, values: Mapping[str, float], *, phase: str) -> None:
+        """Append one row to ``metrics.jsonl``, and to the logger if there is one.
+
+        Args:
+            step: the phase's own count, such as environment steps; resuming goes by it.
+            values: measurements, with their group in the key, such as ``"ppo/loss"``.
+            phase: the part of the run, such as ``"fit"`` or ``"ppo"``.
+        """
+        self._metrics.write(phase, step, values)
+        if self._logger_name is None:
+            return
+        if self._logger is None:
+            self._logger = make_logger(self._logger_name, self.folder)  # type: ignore[arg-type]
+        for key, value in values.items():
+            self._logger.log_scalar(key, float(value), step=step)
+
+    def truncate_metrics(self, phase: str, step: int) -> None:
+        """Forget the rows of ``phase`` later than ``step``, before continuing from there.
+
+        What a logger such as TensorBoard has already shown stays there.
+        """
+        self._metrics.truncate(phase, step)
+
+    def save(self, name: str, state: dict[str, Any]) -> None:
+        """Save the checkpoint ``name``, replacing its predecessor at once."""
+        save_state(self.folder / f"{name}.safetensors", state)
+
+    def load(self, name: str) -> dict[str, Any] | None:
+        """The checkpoint ``name``, or None if there is none yet."""
+        path = self.folder / f"{name}.safetensors"
+        return load_state(path) if path.exists() else None
+
+    @property
+    def result(self) -> dict[str, Any] | None:
+        """What :meth:`finish` wrote, or None while the run is not finished."""
+        path = self.folder / "result.json"
+        return read_json(path) if path.exists() else None
+
+    @property
+    def finished(self) -> bool:
+        """Whether the run has a result."""
+        return (self.folder / "result.json").exists()
+
+    def finish(self, result: dict[str, Any]) -> None:
+        """Write ``result.json``, which marks the run as finished."""
+        write_json(self.folder / "result.json", result)
+
+    def close(self) -> None:
+        """Let another process have the folder."""
+        experiment: Any = getattr(self._logger, "experiment", None)
+        if hasattr(experiment, "close"):
+            experiment.close()
+        self._logger = None
+        self._lock.release()
+
+    def __enter__(self) -> Run:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def _refuse_foreign_folder(self) -> None:
+        if self.folder.exists() and not self.folder.is_dir():
+            raise UserError(f"{self.folder} is a file: choose another out=.")
+        if not self.folder.exists() or (self.folder / "config.yaml").exists():
+            return
+        others = sorted(
+            path.name
+            for path in self.folder.iterdir()
+            if path.name != ".lock" and not path.match(".*.tmp")
+        )
+        if others:
+            raise UserError(
+                f"{self.folder} is not a run's folder and is not empty (it holds {others[0]}): "
+                "choose another out=."
+            )
+
+    def _write_or_compare_config(self, ignore: Collection[str]) -> None:
+        path = self.folder / "config.yaml"
+        # Through JSON, so that tuples and lists compare equal, as they do once written.
+        config = json.loads(json.dumps({"recipe": self.recipe, **self.config}))
+        if not path.exists():
+            write_atomically(path, yaml.safe_dump(config, sort_keys=False))
+            return
+        try:
+            before = yaml.safe_load(path.read_text(encoding="utf-8"))
+        except (OSError, ValueError, yaml.YAMLError):
+            before = None
+        if not isinstance(before, dict):
+            raise UserError(f"{path} cannot be read: choose another out=, or delete the folder.")
+        differences = _differences(before, config, ignore)
+        if differences:
+            more = f" and {len(differences) - 3} more" if len(differences) > 3 else ""
+            raise UserError(
+                f"{self.folder} was made with other settings ({'; '.join(differences[:3])}{more}): "
+                "choose another out=, or delete the folder."
+            )
+
+    def _write_versions(self) -> None:
+        path = self.folder / "versions.json"
+        before = read_json(path) if path.exists() else self.versions
+        for name, now in self.versions.items():
+            if before.get(name) != now:
+                warnings.warn(
+                    f"{self.folder} was begun with {name} {before.get(name)} and continues with "
+                    f"{now}: its numbers may not repeat.",
+                    stacklevel=4,
+                )
+        write_json(path, self.versions)
+
+
+def _flatten(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for key, value in config.items():
+        name = f"{prefix}{key}"
+        if isinstance(value, Mapping) and value:
+            flat.update(_flatten(value, f"{name}."))
+        else:
+            flat[name] = value
+    return flat
+
+
+def _differences(
+    before: Mapping[str, Any], now: Mapping[str, Any], ignore: Collection[str]
+) -> list[str]:
+    """``"ppo.lr: 0.1 there, 0.2 now"`` for each dotted key whose values differ."""
+    old, new = _flatten(before), _flatten(now)
+    return [
+        f"{key}: {old.get(key, 'nothing')!s} there, {new.get(key, 'nothing')!s} now"
+        for key in [*new, *(key for key in old if key not in new)]
+        if not any(key == name or key.startswith(f"{name}.") for name in ignore)
+        and (key not in old or key not in new or old[key] != new[key])
+    ]

@@ -1,0 +1,14 @@
+"""TorchRL transforms of rewards: the same in an environment, on a batch, in a replay buffer."""
+
+from giril_rl.transforms.batch_mean import BatchMeanReward
+from giril_rl.transforms.intrinsic import IntrinsicReward
+from giril_rl.transforms.running import discounted_filter, running_moments
+from giril_rl.transforms.scaling import ReturnScaling
+
+__all__ = [
+    "BatchMeanReward",
+    "IntrinsicReward",
+    "ReturnScaling",
+    "discounted_filter",
+    "running_moments",
+]

@@ -1,0 +1,241 @@
+"""Rewards divided by the running deviation of their discounted return."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any, Literal, get_args
+
+import torch
+from tensordict import TensorDictBase, unravel_key
+from tensordict.utils import NestedKey
+from torch import Tensor
+from torchrl.data import Bounded, Composite, Unbounded
+from torchrl.envs import Transform
+
+from giril_rl.errors import UserError
+from giril_rl.transforms.running import discounted_filter, running_moments
+
+ResetRule = Literal["never", "done"]
+
+# OpenAI baselines' RunningMeanStd starts as if it had seen this many values, of variance 1.
+INITIAL_COUNT = 1e-4
+
+
+class ReturnScaling(Transform):
+    """Divides the reward by the running standard deviation of ``R_t = gamma * R_{t-1} + r_t``.
+
+    No mean is subtracted, so that a reward keeps its sign. The filter runs over time, for each
+    environment, and goes on from one batch to the next. The reward of step t is divided by the
+    deviation of all filtered returns up to and including those of step t in all environments:
+    step by step or a whole batch at once, the numbers are the same.
+
+    Sources: Burda et al. 2018, "Large-Scale Study of Curiosity-Driven Learning" (arXiv
+    1808.04355) and the same authors' RND, whose RewardForwardFilter never resets; with
+    ``reset="done"`` as OpenAI baselines' VecNormalize and Gymnasium's NormalizeReward, which
+    forget the return at an episode's end. As in baselines, the moments start as if 1e-4 values of
+    mean 0 and variance 1 had been seen, and the scaled reward is clipped.
+
+    In an environment all batch dimensions are environments. In a batch, ``time_dim`` is time and
+    the others are environments; a flat batch is one environment's time. Inside a worker of a
+    batched environment it would see one environment only, and refuses.
+
+    After :meth:`freeze` nothing is learned: rewards of any batch shape, also shuffled, are divided
+    by the present deviation. For batches, eval mode does the same. In an environment it does not,
+    because TorchRL puts every attached transform in eval mode.
+
+    Args:
+        gamma: discount of the filter, in [0, 1].
+        reward_key: the reward, without the ``"next"``.
+        reset: ``"never"``, or ``"done"``: at the end of an episode, and at a manual reset of the
+            environment.
+        clip: scaled rewards are clipped to plus or minus this; None does not clip.
+        eps: added to the variance.
+        time_dim: which of the batch dimensions is time.
+        done_key: the end of an episode, without the ``"next"``; read for ``reset="done"`` only.
+
+    Raises:
+        UserError: for a gamma, reset rule, clip or eps that makes no sense, a batch with another
+            number of environments than before, or when frozen before anything was learned.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> scaling = ReturnScaling(gamma=0.0)
+        >>> reward = torch.tensor([[[1.0]], [[-1.0]], [[3.0]], [[-3.0]]])  # 4 environments, 1 step
+        >>> batch = scaling(TensorDict({"next": {"reward": reward}}, [4, 1]))
+        >>> batch["next", "reward"].flatten()  # their deviation is nearly the root of 5
+        tensor([ 0.4472, -0.4472,  1.3417, -1.3417])
+    """
+
+    count: Tensor
+    mean: Tensor
+    m2: Tensor
+    running_return: Tensor
+
+    def __init__(
+        self,
+        gamma: float = 0.99,
+        *,
+        reward_key: NestedKey = "reward",
+        reset: ResetRule = "never",
+        clip: float | None = 10.0,
+        eps: float = 1e-8,
+        time_dim: int = -1,
+        done_key: NestedKey = "done",
+    ) -> None:
+        if not 0 <= gamma <= 1:
+            raise UserError(f"gamma={gamma} is outside [0, 1]: give a discount such as 0.99.")
+        if reset not in get_args(ResetRule):
+            raise UserError(f"reset={reset!r} is unknown: choose never or done.")
+        if clip is not None and not clip > 0:
+            raise UserError(f"clip={clip} is not positive: give a bound such as 10.0, or None.")
+        if not (eps >= 0 and math.isfinite(eps)):
+            raise UserError(f"eps={eps} is negative or not finite: give a value such as 1e-8.")
+        self.reward_key = unravel_key(reward_key)
+        super().__init__(in_keys=[self.reward_key], out_keys=[self.reward_key])
+        self.done_key = unravel_key(done_key)
+        self.gamma = gamma
+        self.reset_rule: ResetRule = reset
+        self.clip = clip
+        self.eps = eps
+        self.time_dim = time_dim
+        self.frozen = False
+        self.register_buffer("count", torch.tensor(INITIAL_COUNT, dtype=torch.float64))
+        self.register_buffer("mean", torch.tensor(0.0, dtype=torch.float64))
+        self.register_buffer("m2", torch.tensor(INITIAL_COUNT, dtype=torch.float64))
+        # One entry for each environment, from the first reward on.
+        self.register_buffer("running_return", torch.zeros(0, dtype=torch.float64))
+
+    @torch.no_grad()
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Scales a batch in place, step after step along ``time_dim``, and returns it."""
+        following = tensordict.get("next", None)
+        if following is None:
+            raise UserError("the batch has no ('next', ...) entries: give whole transitions.")
+        time_dim = self.time_dim % tensordict.ndim if tensordict.ndim else None
+        learn = self.training and not self.frozen
+        return tensordict.set("next", self._scale(following, time_dim, learn))
+
+    @torch.no_grad()
+    def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
+        return self._scale(next_tensordict, None, not self.frozen)
+
+    def freeze(self) -> ReturnScaling:
+        """Stops learning; rewards are divided by the present deviation."""
+        self.frozen = True
+        return self
+
+    def unfreeze(self) -> ReturnScaling:
+        """Goes on learning."""
+        self.frozen = False
+        return self
+
+    def _scale(
+        self, following: TensorDictBase, time_dim: int | None, learn: bool
+    ) -> TensorDictBase:
+        reward = following.get(self.reward_key)
+        steps = _as_steps(reward, time_dim, self.mean)
+        if learn:
+            done = None
+            if self.reset_rule == "done":
+                flag = following.get(self.done_key)
+                while flag.ndim < reward.ndim:
+                    flag = flag.unsqueeze(-1)
+                done = _as_steps(flag.expand_as(reward), time_dim, self.mean).bool()
+            deviation = self._learn(steps, done)
+        elif self.running_return.numel() == 0:
+            raise UserError(
+                "ReturnScaling has learned nothing yet and is in eval mode (TorchRL's "
+                "Compose.append and replay buffers do that) or frozen: call .train() and "
+                ".unfreeze(), or load its state."
+            )
+        else:
+            deviation = (self.m2 / self.count + self.eps).sqrt()
+        scaled = steps / deviation
+        if self.clip is not None:
+            scaled = scaled.clamp(-self.clip, self.clip)
+        return following.set(self.reward_key, _from_steps(scaled, reward, time_dim))
+
+    def _learn(self, steps: Tensor, done: Tensor | None) -> Tensor:
+        envs = steps.shape[0]
+        if self.running_return.numel() == 0:
+            self.running_return = self.running_return.new_zeros(envs)
+        if self.running_return.shape[0] != envs:
+            raise UserError(
+                f"the running returns are those of {self.running_return.shape[0]} environments "
+                f"and the batch has {envs}: give whole batches with time along "
+                f"time_dim={self.time_dim}, or call .freeze() to scale without learning."
+            )
+        returns, carry = discounted_filter(steps, done, self.running_return, self.gamma)
+        count, mean, m2 = running_moments(returns, self.count, self.mean, self.m2)
+        if steps.shape[1]:
+            self.running_return.copy_(carry)
+            self.count.copy_(count[-1])
+            self.mean.copy_(mean[-1])
+            self.m2.copy_(m2[-1])
+        return (m2 / count + self.eps).sqrt()
+
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        if self.reset_rule == "done" and not self.frozen and self.running_return.numel():
+            root = tensordict.get("_reset", None)
+            mask = tensordict.get(_reset_key(self.done_key), root)
+            if mask is None:
+                self.running_return.zero_()
+            else:
+                shape = self.parent.full_reward_spec[self.reward_key].shape
+                while mask.ndim < len(shape):
+                    mask = mask.unsqueeze(-1)
+                mask = mask.expand(shape).reshape(-1).to(self.running_return.device)
+                self.running_return.masked_fill_(mask, 0.0)
+        return tensordict_reset
+
+    def _reset_on_native_autoreset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        return self._reset(tensordict, tensordict_reset)
+
+    def transform_reward_spec(self, reward_spec: Composite) -> Composite:
+        """The scaled reward's bounds are the clipping's."""
+        spec = reward_spec[self.reward_key]
+        kind: dict[str, Any] = {"shape": spec.shape, "dtype": spec.dtype, "device": spec.device}
+        if self.clip is None:
+            reward_spec[self.reward_key] = Unbounded(**kind)
+        else:
+            reward_spec[self.reward_key] = Bounded(-self.clip, self.clip, **kind)
+        return reward_spec
+
+    def _check_batched_worker_compat(self) -> None:
+        raise UserError(
+            "ReturnScaling inside a worker sees one environment only: put it outside, "
+            "TransformedEnv(ParallelEnv(...), ReturnScaling())."
+        )
+
+    def _load_from_state_dict(
+        self, state_dict: Mapping[str, Any], prefix: str, *args: Any, **kwargs: Any
+    ) -> None:
+        saved = state_dict.get(f"{prefix}running_return")
+        if saved is not None:
+            self.running_return = self.running_return.new_zeros(saved.shape)
+        super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
+
+
+def _as_steps(value: Tensor, time_dim: int | None, like: Tensor) -> Tensor:
+    """Environments (and whatever else a reward has dimensions for) by time, ``(M, T)``."""
+    value = value.to(like)
+    if time_dim is None:
+        return value.reshape(-1, 1)
+    value = value.movedim(time_dim, -1)
+    return value.reshape(-1, value.shape[-1])
+
+
+def _from_steps(steps: Tensor, like: Tensor, time_dim: int | None) -> Tensor:
+    """The inverse of :func:`_as_steps`, in the shape, dtype and device of ``like``."""
+    if time_dim is not None:
+        steps = steps.reshape(like.movedim(time_dim, -1).shape).movedim(-1, time_dim)
+    return steps.reshape(like.shape).to(like)
+
+
+def _reset_key(done_key: NestedKey) -> NestedKey:
+    return "_reset" if isinstance(done_key, str) else (*done_key[:-1], "_reset")

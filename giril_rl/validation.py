@@ -1,0 +1,113 @@
+"""Values of the right type that are wrong all the same, refused before anything is trained."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import fields, is_dataclass
+from typing import Any
+
+from giril_rl.configs import DemoConfig, PPOConfig
+from giril_rl.errors import UserError
+from giril_rl.schema import leaves
+
+
+def _show(value: Any) -> str:
+    return "null" if value is None else str(value).replace(" ", "")
+
+
+def _range(metadata: Any) -> str:
+    low, high = metadata.get("low"), metadata.get("high")
+    if high is None:
+        return f"{'above' if metadata['low_open'] else 'at least'} {low:g}"
+    if low is None:
+        return f"{'below' if metadata['high_open'] else 'at most'} {high:g}"
+    left = "(" if metadata["low_open"] else "["
+    right = ")" if metadata["high_open"] else "]"
+    return f"in {left}{low:g}, {high:g}{right}"
+
+
+def _inside(number: float, metadata: Any) -> bool:
+    low, high = metadata.get("low"), metadata.get("high")
+    if low is not None and (number < low or (number == low and metadata["low_open"])):
+        return False
+    return high is None or number < high or (number == high and not metadata["high_open"])
+
+
+def _check_ppo(key: str, ppo: PPOConfig) -> None:
+    batch = ppo.num_envs * ppo.rollout
+    if batch % ppo.minibatch:
+        raise UserError(
+            f"{key}.minibatch={ppo.minibatch} does not divide {key}.num_envs * {key}.rollout "
+            f"= {ppo.num_envs} * {ppo.rollout} = {batch}: choose one that does."
+        )
+
+
+def _check_demo(key: str, demo: DemoConfig) -> None:
+    if (demo.length is None) == (demo.episodes is None):
+        raise UserError(
+            f"{key}.length={_show(demo.length)} and {key}.episodes={_show(demo.episodes)}: "
+            "give exactly one of them and set the other to null."
+        )
+    if demo.length is not None and demo.subsample > demo.length:
+        raise UserError(
+            f"{key}.subsample={demo.subsample} leaves nothing of {key}.length={demo.length}: "
+            "choose a smaller one."
+        )
+
+
+_PART_CHECKS: dict[type, Callable[[str, Any], None]] = {
+    PPOConfig: _check_ppo,
+    DemoConfig: _check_demo,
+}
+
+
+def _check_parts(config: Any, prefix: str = "") -> None:
+    for part in fields(config):
+        value = getattr(config, part.name)
+        if is_dataclass(value):
+            key = f"{prefix}{part.name}"
+            for kind, check in _PART_CHECKS.items():
+                if isinstance(value, kind):
+                    check(key, value)
+            _check_parts(value, f"{key}.")
+
+
+def validate(config: Any) -> None:
+    """Check every knob's choices and bounds, then what single knobs cannot tell.
+
+    Numbers must be finite; a list's entries are checked one by one; null passes where the type
+    has it.
+
+    Args:
+        config: an instance of a recipe's ``Config`` or of any part of one.
+
+    Raises:
+        UserError: names the first key whose value is refused.
+
+    Examples:
+        >>> from giril_rl.configs import GenerativeConfig
+        >>> validate(GenerativeConfig(beta=0.0))
+        Traceback (most recent call last):
+        ...
+        giril_rl.errors.UserError: beta=0.0 must be in (0, 1].
+    """
+    for leaf in leaves(type(config)):
+        value = config
+        for name in leaf.key.split("."):
+            value = getattr(value, name)
+        if value is None:
+            continue
+        if leaf.choices and value not in leaf.choices:
+            allowed = ", ".join(leaf.choices) + (", null" if leaf.optional else "")
+            raise UserError(f"{leaf.key}={_show(value)}: choose one of {allowed}.")
+        for number in value if isinstance(value, list) else [value]:
+            if isinstance(number, (str, bool)):
+                continue
+            if not math.isfinite(number):
+                raise UserError(f"{leaf.key}={_show(value)}: a finite number is needed.")
+            if not _inside(number, leaf.metadata):
+                each = ": each entry" if isinstance(value, list) else ""
+                words = f"{each} must be {_range(leaf.metadata)}"
+                raise UserError(f"{leaf.key}={_show(value)}{words}.")
+    _check_parts(config)

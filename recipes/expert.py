@@ -1,0 +1,24 @@
+"""Expert: PPO on the environment's own reward, the player that the other recipes imitate."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from giril_rl.configs import ExpertRunConfig
+from giril_rl.training import expert_folder, train_expert
+
+
+@dataclass
+class Config(ExpertRunConfig):
+    """What `giril run expert` takes."""
+
+
+def default_out(cfg: Config) -> Path:
+    """Where the other recipes look for an expert of these settings."""
+    return expert_folder(cfg)
+
+
+def main(cfg: Config, out: Path) -> None:
+    """Train an expert and leave its run folder in ``out``."""
+    train_expert(cfg, out)

@@ -1,0 +1,96 @@
+"""GIRIL: a reward from a generative model of the demonstration, and a policy that maximises it.
+
+Expert -> demonstration -> conditional VAE -> intrinsic reward -> PPO -> score on the true reward.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+from torchrl.envs import Compose
+
+from giril_rl.configs import (
+    DemoConfig,
+    ExpertConfig,
+    FitConfig,
+    GenerativeConfig,
+    RunConfig,
+    ScalingConfig,
+)
+from giril_rl.demos import holdout, subsample
+from giril_rl.envs import make_env
+from giril_rl.rewards import GenerativeReward, GenerativeRewardLoss
+from giril_rl.training import (
+    Run,
+    finish_run,
+    fit_reward,
+    make_agent,
+    obtain_demonstration,
+    train_ppo,
+)
+from giril_rl.transforms import BatchMeanReward, IntrinsicReward, ReturnScaling
+
+
+@dataclass
+class Config(RunConfig):
+    """What `giril run giril` takes."""
+
+    expert: ExpertConfig = field(default_factory=ExpertConfig)
+    demo: DemoConfig = field(default_factory=DemoConfig)
+    reward: GenerativeConfig = field(default_factory=GenerativeConfig)
+    fit: FitConfig = field(default_factory=FitConfig)
+    scaling: ScalingConfig = field(default_factory=ScalingConfig)
+
+
+def main(cfg: Config, out: Path) -> None:
+    """Train the whole chain and leave its run folder in ``out``."""
+    with Run.open(out, asdict(cfg), recipe="giril", logger=cfg.logger) as run:
+        if run.finished:
+            return
+        demo, expert = obtain_demonstration(cfg, cfg.expert, cfg.demo)
+        env = make_env(cfg.task, cfg.ppo.num_envs, cfg.seed)
+
+        reward_seed = cfg.seed if cfg.reward.seed is None else cfg.reward.seed
+        reward = GenerativeReward.for_vectors(
+            env.observation_spec["observation"].shape[-1],
+            env.action_spec,
+            hidden=cfg.reward.hidden,
+            beta=cfg.reward.beta,
+            scale=cfg.reward.scale,
+            prior=cfg.reward.prior,
+            normalise=cfg.reward.normalise,
+            clamp=cfg.reward.clamp,
+            seed=reward_seed,
+        )
+        reward.scaler.fit(demo.transitions["observation"])
+        fit_reward(
+            GenerativeRewardLoss(reward, alpha=cfg.reward.alpha),
+            subsample(demo, cfg.demo.subsample),
+            cfg.fit,
+            seed=reward_seed,
+            run=run,
+            held_out=holdout(demo, cfg.demo.subsample),
+        )
+
+        relabel = [IntrinsicReward(reward)]
+        if cfg.batch_mean:
+            relabel.append(BatchMeanReward())
+        if cfg.scaling.enabled:
+            relabel.append(
+                ReturnScaling(cfg.ppo.gamma, reset=cfg.scaling.reset, clip=cfg.scaling.clip)
+            )
+        agent = make_agent(env, cfg.ppo, cfg.seed)
+        trained = train_ppo(
+            env, agent, Compose(*relabel), cfg.ppo, steps=cfg.steps, seed=cfg.seed, run=run
+        )
+        finish_run(
+            run,
+            cfg,
+            agent,
+            trained,
+            method="giril",
+            expert=expert,
+            demo=demo,
+            seeds={"reward": reward_seed, "expert": cfg.expert.seed, "demo": cfg.demo.seed},
+        )

@@ -1,0 +1,73 @@
+import pytest
+import torch
+
+from giril_rl.errors import UserError
+from giril_rl.rewards import ObservationScaler
+
+DEMO = torch.tensor([[0.0, 10.0, 3.0], [4.0, 30.0, 3.0], [1.0, 20.0, 3.0], [3.0, 20.0, 3.0]])
+
+
+def test_demo_range_by_hand():
+    scaler = ObservationScaler(3, rule="demo_range", clamp=False).fit(DEMO)
+    out = scaler(torch.tensor([[0.0, 30.0, 3.0], [6.0, 20.0, 3.5]]))
+    assert out.tolist() == [[-1.0, 1.0, 0.0], [2.0, 0.0, 0.5]]
+
+
+def test_standardise_by_hand():
+    scaler = ObservationScaler(3, rule="standardise", clamp=False).fit(DEMO)
+    # means 2, 20, 3; population deviations sqrt(10 / 4), sqrt(200 / 4), none
+    expected = [2.0 / 2.5**0.5, 10.0 / 50.0**0.5, 0.25]
+    out = scaler(torch.tensor([4.0, 30.0, 3.25]))
+    torch.testing.assert_close(out, torch.tensor(expected))
+
+
+@pytest.mark.parametrize("rule", ["demo_range", "standardise"])
+def test_constant_dimension_is_shifted_only(rule):
+    # 0.1 has no exact float, so that its computed deviation is not exactly zero either.
+    scaler = ObservationScaler(1, rule=rule, clamp=False).fit(torch.full((1000, 1), 0.1))
+    torch.testing.assert_close(scaler(torch.tensor([[0.1], [1.1]])), torch.tensor([[0.0], [1.0]]))
+    assert scaler.scale.item() == 1.0
+
+
+def test_small_scales_are_not_taken_for_constant():
+    scaler = ObservationScaler(1, rule="demo_range").fit(torch.tensor([[0.0], [1e-7]]))
+    torch.testing.assert_close(scaler(torch.tensor([1e-7])), torch.tensor([1.0]))
+
+
+def test_clamp():
+    clamped = ObservationScaler(3, rule="demo_range", clamp=True).fit(DEMO)
+    assert clamped(torch.tensor([100.0, -100.0, 3.0])).tolist() == [1.0, -1.0, 0.0]
+    raw = ObservationScaler(2, rule="raw", clamp=True)
+    assert raw(torch.tensor([0.3, 7.0])).tolist() == [pytest.approx(0.3), 1.0]
+    assert ObservationScaler(1, rule="raw", clamp=False)(torch.tensor([7.0])).item() == 7.0
+
+
+def test_any_batch_shape_and_dtype():
+    scaler = ObservationScaler(3).fit(DEMO.view(2, 2, 3))
+    torch.testing.assert_close(scaler.offset, torch.tensor([2.0, 20.0, 3.0]))
+    assert scaler(torch.zeros(5, 7, 3, dtype=torch.float64)).shape == (5, 7, 3)
+    assert scaler(torch.zeros(3, dtype=torch.float64)).dtype == torch.float32
+
+
+def test_state_round_trip_into_unfitted():
+    fitted, fresh = ObservationScaler(3).fit(DEMO), ObservationScaler(3)
+    fresh.load_state_dict(fitted.state_dict())
+    torch.testing.assert_close(fresh(DEMO), fitted(DEMO))
+
+
+def test_unfitted_is_refused():
+    with pytest.raises(UserError, match=r"scaler\.fit"):
+        ObservationScaler(3)(DEMO)
+
+
+@pytest.mark.parametrize(
+    "demo", [torch.zeros(4, 2), torch.zeros(3), torch.zeros(0, 3), torch.full((2, 3), torch.nan)]
+)
+def test_bad_demonstration(demo):
+    with pytest.raises(UserError):
+        ObservationScaler(3).fit(demo)
+
+
+def test_unknown_rule():
+    with pytest.raises(UserError, match="minmax"):
+        ObservationScaler(3, rule="minmax")

@@ -1,0 +1,201 @@
+from dataclasses import fields, is_dataclass, replace
+
+import pytest
+
+from giril_rl.compose import groups, resolved
+from giril_rl.configs import RunConfig, TaskConfig
+from giril_rl.errors import UserError
+from giril_rl.naming import config_hash, out_folder, safe, variant
+from giril_rl.overrides import sweep
+from giril_rl.recipe_config import config_class
+from giril_rl.recipes import find, shipped
+
+GIRIL = find("giril")
+CONFIG = config_class(GIRIL)
+
+
+def config_of(*texts):
+    return resolved(GIRIL, CONFIG, texts)[0]
+
+
+def out_of(*texts):
+    config, changes = resolved(GIRIL, CONFIG, texts)
+    return out_folder("giril", config, changes).as_posix()
+
+
+def test_result_is_the_recipes_own_dataclass():
+    config = config_of("ppo.lr=1e-3", "ppo.hidden=[8,4]", "seed=3")
+    assert type(config) is CONFIG
+    for part in fields(config):
+        assert "DictConfig" not in type(getattr(config, part.name)).__name__
+    assert is_dataclass(config.ppo)
+    assert (config.ppo.lr, config.ppo.hidden, config.seed) == (1e-3, [8, 4], 3)
+    assert type(config.ppo.hidden) is list
+
+
+@pytest.mark.parametrize(
+    ("task", "env_id", "steps", "score"),
+    [
+        ("inverted_pendulum", "InvertedPendulumBulletEnv-v0", 300_000, 990),
+        ("inverted_double_pendulum", "InvertedDoublePendulumBulletEnv-v0", 1_000_000, 9_000),
+    ],
+)
+def test_tasks(task, env_id, steps, score):
+    config = config_of(f"task={task}")
+    assert config.task == TaskConfig(task, env_id, None, steps, score)
+    assert config.steps == steps
+
+
+def test_steps_follow_the_task_unless_given():
+    assert config_of("task.steps=7").steps == 7
+    assert config_of("steps=9", "task=inverted_double_pendulum").steps == 9
+
+
+def test_expert_trains_for_five_million_steps():
+    expert = find("expert")
+    assert resolved(expert, config_class(expert), [])[0].steps == 5_000_000
+
+
+@pytest.mark.parametrize(("profile", "mean"), [("released", True), ("paper", False)])
+def test_profiles(profile, mean):
+    config = config_of(f"profile={profile}")
+    assert (config.profile, config.batch_mean) == (profile, mean)
+    assert config_of(f"profile={profile}", "batch_mean=true").batch_mean is True
+
+
+def test_an_environment_alone_chooses_the_gymnasium_task():
+    config = config_of("task.env_id=ALE/Pong-v5")
+    assert (config.task.name, config.task.env_id) == ("ALE/Pong-v5", "ALE/Pong-v5")
+    assert config.task.expert_score is None
+    kept = config_of("task=inverted_pendulum", "task.env_id=Other-v0").task
+    assert (kept.name, kept.env_id) == ("inverted_pendulum", "Other-v0")
+
+
+@pytest.mark.parametrize("recipe", shipped(), ids=lambda recipe: recipe.name)
+def test_every_shipped_recipe_composes_with_every_choice(recipe):
+    schema = config_class(recipe)
+    for group, (names, default) in groups(recipe).items():
+        assert default in names
+        for name in names:
+            extra = ["task.env_id=Pendulum-v1"] if name == "gymnasium" else []
+            resolved(recipe, schema, [f"{group}={name}", *extra])
+
+
+@pytest.mark.parametrize(
+    ("texts", "sentence"),
+    [
+        (
+            ["ppo.learning_rate=1"],
+            "'ppo.learning_rate' is not a key of giril; did you mean 'ppo.lr'?",
+        ),
+        (["lr=1"], "'lr' is not a key of giril; did you mean 'fit.lr' or 'ppo.lr'?"),
+        (["sede=1"], "'sede' is not a key of giril; did you mean 'seed'?"),
+        (["taks=foo"], "'taks' is not a key of giril; did you mean 'task'?"),
+        (["ppo={lrr:1}"], "'ppo.lrr' is not a key of giril; did you mean 'ppo.lr'?"),
+        (["eval.zzz=1"], "'eval.zzz' is not a key of giril: eval has episodes, seed."),
+        (["qqq=1"], "'qqq' is not a key of giril: see `giril run giril --help`."),
+        (["hydra.x=1"], "'hydra.x' is not a key of giril: see `giril run giril --help`."),
+        (
+            ["task=foo"],
+            "task=foo: choose one of gymnasium, inverted_double_pendulum, inverted_pendulum.",
+        ),
+        (["profile=foo"], "profile=foo: choose one of paper, released."),
+        (["seed=abc"], "seed=abc: a whole number is needed."),
+        (["seed="], "seed=: a whole number is needed."),
+        (["seed=null"], "seed=null: a whole number is needed."),
+        (["steps=1e5"], "steps=1e5: a whole number is needed, such as 100000."),
+        (["ppo.lr=fast"], "ppo.lr=fast: a number is needed."),
+        (["ppo.anneal_lr=maybe"], "ppo.anneal_lr=maybe: true or false is needed."),
+        (["scaling.clip=x"], "scaling.clip=x: a number or null is needed."),
+        (["ppo.hidden=3"], "ppo.hidden=3: a list of whole numbers such as [100,100] is needed."),
+        (["ppo=3"], "ppo=3: ppo holds several keys; set one, such as ppo.num_envs."),
+        (["seed"], "'seed' is not of the form key=value."),
+        (["=3"], "'=3' is not of the form key=value."),
+        (["+new=1"], "+new=1: keys can be changed, not added or removed; write key=value."),
+        (["~seed"], "~seed: keys can be changed, not added or removed; write key=value."),
+        (["seed=1", "seed=2"], "seed is given twice: give it once."),
+        (["seed=1,2"], "seed=1,2 gives several values: add -m to run one after another."),
+        (
+            ["task=gymnasium"],
+            "task.env_id has no value: give one, such as task.env_id=Pendulum-v1.",
+        ),
+        (["reward.beta=2"], "reward.beta=2.0 must be in (0, 1]."),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
+)
+def test_refusals(texts, sentence):
+    with pytest.raises(UserError) as refusal:
+        config_of(*texts)
+    assert str(refusal.value) == sentence
+
+
+@pytest.mark.parametrize(
+    "text", ["out=a b(", "ppo.hidden=[1,2", "seed=${ppo.foo}", "steps=${root}"]
+)
+def test_unreadable_values_are_refused_in_one_line(text):
+    with pytest.raises(UserError) as refusal:
+        config_of(text)
+    assert "\n" not in str(refusal.value)
+    assert str(refusal.value).endswith(".")
+
+
+def test_sweep_is_the_product_of_all_values():
+    assert sweep(["seed=range(0,2)", "ppo.lr=0.1,0.2", "steps=5"]) == [
+        ["seed=0", "ppo.lr=0.1", "steps=5"],
+        ["seed=0", "ppo.lr=0.2", "steps=5"],
+        ["seed=1", "ppo.lr=0.1", "steps=5"],
+        ["seed=1", "ppo.lr=0.2", "steps=5"],
+    ]
+
+
+@pytest.mark.parametrize("text", ["ppo.lr=interval(0,1)", "task=glob(*)"])
+def test_a_sweep_without_values_is_refused(text):
+    with pytest.raises(UserError, match="needs its values listed"):
+        sweep([text])
+
+
+@pytest.mark.parametrize(
+    ("texts", "folder"),
+    [
+        ([], "runs/giril/inverted_pendulum/default/seed0"),
+        (["seed=3", "logger=csv", "threads=2"], "runs/giril/inverted_pendulum/default/seed3"),
+        (
+            ["root=/data", "profile=paper", "ppo.lr=1e-3", "task=inverted_double_pendulum"],
+            "/data/giril/inverted_double_pendulum/ppo.lr=0.001,profile=paper/seed0",
+        ),
+        (["task.env_id=Pendulum-v1"], "runs/giril/Pendulum-v1/default/seed0"),
+        (
+            ["task=inverted_pendulum", "task.env_id=Pendulum-v1"],
+            "runs/giril/inverted_pendulum/task.env_id=Pendulum-v1/seed0",
+        ),
+        (["ppo.hidden=[64,64]"], "runs/giril/inverted_pendulum/ppo.hidden=64,64/seed0"),
+        (["out=here/there", "seed=1"], "here/there"),
+        (["out='o/${task.name}/${seed}'", "seed=1"], "o/inverted_pendulum/1"),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else "",
+)
+def test_out_folder(texts, folder):
+    assert out_of(*texts) == folder
+
+
+def test_the_order_of_changes_does_not_move_a_run():
+    assert out_of("ppo.lr=0.1", "fit.steps=5") == out_of("fit.steps=5", "ppo.lr=1e-1")
+
+
+def test_names_are_safe_short_and_distinct():
+    long = [{"a": "a=" + "x" * 100 + end} for end in "12"]
+    first, second = map(variant, long)
+    assert len(first) == len(second) == 80
+    assert first != second
+    assert variant({"a": "a=b/c"}) != variant({"a": "a=b-c"})
+    assert "/" not in safe("../a b") and not safe("../a b").startswith(".")
+
+
+def test_config_hash_tells_configurations_apart():
+    config = config_of()
+    same = replace(config, out="x", root="y", logger=None, threads=2)
+    assert config_hash(same) == config_hash(config)
+    assert config_hash(replace(config, seed=1)) != config_hash(config)
+    assert config_hash(config_of("ppo.lr=0.1")) != config_hash(config)
+    assert len(config_hash(config)) == 12
+    assert set(config_hash(RunConfig())) <= set("0123456789abcdef")

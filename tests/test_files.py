@@ -1,0 +1,32 @@
+import os
+
+import pytest
+
+from giril_rl.errors import UserError
+from giril_rl.files import read_json, write_atomically, write_json
+
+
+def test_failed_write_keeps_the_old_file_and_leaves_nothing_else(tmp_path, monkeypatch):
+    path = tmp_path / "a.txt"
+    write_atomically(path, "old")
+
+    def fail(*_):
+        raise OSError("disk full")
+
+    monkeypatch.setattr(os, "replace", fail)
+    with pytest.raises(OSError, match="disk full"):
+        write_atomically(path, "new")
+    assert path.read_text() == "old"
+    assert os.listdir(tmp_path) == ["a.txt"]
+
+
+def test_json_round_trip_and_refusals(tmp_path):
+    path = tmp_path / "deep" / "a.json"
+    write_json(path, {"x": 0.1})
+    assert read_json(path) == {"x": 0.1}
+    path.write_text("[1]")
+    with pytest.raises(UserError, match="not hold a JSON object"):
+        read_json(path)
+    path.write_text('{"x": ')
+    with pytest.raises(UserError, match="cannot be read as JSON"):
+        read_json(path)

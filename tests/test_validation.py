@@ -1,0 +1,135 @@
+import math
+from dataclasses import dataclass, field
+
+import pytest
+
+from giril_rl.configs import (
+    DemoConfig,
+    FitConfig,
+    GenerativeConfig,
+    PPOConfig,
+    RunConfig,
+    ScalingConfig,
+    TaskConfig,
+    knob,
+)
+from giril_rl.errors import UserError
+from giril_rl.validation import validate
+
+
+@dataclass
+class Config(RunConfig):
+    demo: DemoConfig = field(default_factory=DemoConfig)
+    reward: GenerativeConfig = field(default_factory=GenerativeConfig)
+    fit: FitConfig = field(default_factory=FitConfig)
+    scaling: ScalingConfig = field(default_factory=ScalingConfig)
+
+
+def good() -> Config:
+    return Config(task=TaskConfig(name="reach", env_id="Reach-v0"), steps=1000)
+
+
+def test_defaults_pass():
+    validate(good())
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "sentence"),
+    [
+        ("reward.beta", 0.0, "reward.beta=0.0 must be in (0, 1]."),
+        ("reward.beta", 1.5, "reward.beta=1.5 must be in (0, 1]."),
+        ("steps", 0, "steps=0 must be at least 1."),
+        ("seed", -1, "seed=-1 must be at least 0."),
+        ("ppo.lr", 0.0, "ppo.lr=0.0 must be above 0."),
+        ("ppo.gamma", 1.01, "ppo.gamma=1.01 must be in [0, 1]."),
+        ("ppo.num_envs", 0, "ppo.num_envs=0 must be at least 1."),
+        ("ppo.hidden", [64, 0], "ppo.hidden=[64,0]: each entry must be at least 1."),
+        ("ppo.lr", math.nan, "ppo.lr=nan: a finite number is needed."),
+        ("scaling.clip", math.inf, "scaling.clip=inf: a finite number is needed."),
+        ("profile", "papier", "profile=papier: choose one of released, paper."),
+        ("reward.prior", "x", "reward.prior=x: choose one of standard, conditional."),
+        (
+            "reward.normalise",
+            "x",
+            "reward.normalise=x: choose one of demo_range, standardise, raw.",
+        ),
+        ("scaling.reset", "x", "scaling.reset=x: choose one of never, done."),
+        ("logger", "x", "logger=x: choose one of tensorboard, csv, wandb, mlflow, null."),
+    ],
+)
+def test_refused_with_one_sentence(key, value, sentence):
+    config = good()
+    part = config
+    *parents, name = key.split(".")
+    for parent in parents:
+        part = getattr(part, parent)
+    setattr(part, name, value)
+    with pytest.raises(UserError) as refusal:
+        validate(config)
+    assert str(refusal.value) == sentence
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("beta", 1.0),
+        ("beta", 1e-6),
+        ("alpha", None),
+        ("alpha", 0.0),
+        ("hidden", []),
+        ("seed", None),
+    ],
+)
+def test_bounds_and_null_pass(key, value):
+    validate(GenerativeConfig(**{key: value}))
+
+
+@pytest.mark.parametrize(
+    ("num_envs", "rollout", "minibatch", "fits"),
+    [
+        (16, 512, 256, True),
+        (3, 10, 30, True),
+        (3, 10, 31, False),
+        (3, 10, 60, False),
+        (2, 8, 3, False),
+    ],
+)
+def test_minibatch_divides_the_batch(num_envs, rollout, minibatch, fits):
+    config = good()
+    config.ppo = PPOConfig(num_envs=num_envs, rollout=rollout, minibatch=minibatch)
+    if fits:
+        validate(config)
+    else:
+        with pytest.raises(UserError, match=rf"ppo\.minibatch={minibatch} does not divide"):
+            validate(config)
+
+
+@pytest.mark.parametrize(
+    ("length", "episodes", "fits"),
+    [(1000, None, True), (None, 5, True), (1000, 5, False), (None, None, False)],
+)
+def test_demonstration_is_measured_one_way(length, episodes, fits):
+    config = good()
+    config.demo = DemoConfig(length=length, episodes=episodes)
+    if fits:
+        validate(config)
+    else:
+        with pytest.raises(UserError, match="exactly one"):
+            validate(config)
+
+
+def test_subsample_leaves_something():
+    config = good()
+    config.demo = DemoConfig(length=19, subsample=20)
+    with pytest.raises(UserError, match=r"demo\.subsample=20 leaves nothing"):
+        validate(config)
+
+
+def test_bounds_of_an_open_upper_end():
+    @dataclass
+    class Part:
+        share: float = knob(0.5, "a share", high=1, high_open=True)
+
+    validate(Part(-3.0))
+    with pytest.raises(UserError, match=r"share=1\.0 must be below 1\."):
+        validate(Part(1.0))
