@@ -93,7 +93,14 @@ def _run(argv: Sequence[str]) -> int:
     module = recipe.load()
 
     def run(out: Path) -> None:
-        module.main(resolved(recipe, module.Config, jobs[out])[0], out)
+        config, _ = resolved(recipe, module.Config, jobs[out])
+        if "torch" in sys.modules:  # As with every recipe that trains something.
+            sys.modules["torch"].set_num_threads(config.threads)
+        module.main(config, out)
+        if (out / "result.json").exists():
+            from giril_rl.training.finished import print_scores
+
+            print_scores(out)
 
     if args.multirun:
         return _run_all(run, {out: " ".join([recipe.word, *job]) for out, job in jobs.items()})
@@ -130,7 +137,7 @@ def _eval(argv: Sequence[str]) -> int:
         raise UserError(f"--episodes {args.episodes}: at least 1 is needed.")
     if args.seed is not None and args.seed < 0:
         raise UserError(f"--seed {args.seed}: at least 0 is needed.")
-    from giril_rl.training.evaluate import evaluate_run
+    from giril_rl.training.finished import evaluate_run
 
     evaluate_run(args.run, args.episodes, args.seed)
     return 0
@@ -182,8 +189,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             hint = did_you_mean(words[0], _COMMANDS) or f": choose one of {', '.join(_COMMANDS)}."
             raise UserError(f"{words[0]!r} is not a command{hint}")
         return _COMMANDS[words[0]][0](words[1:])
-    except KeyboardInterrupt:
-        print("giril: interrupted.", file=sys.stderr)
+    except KeyboardInterrupt as interrupt:
+        print(f"giril: {interrupt or 'interrupted'}.", file=sys.stderr)
         return 130
     except Exception as error:
         return _report(error, show_traceback)

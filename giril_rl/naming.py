@@ -10,6 +10,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from giril_rl.configs import ExpertRunConfig
+
 _OWN_PLACE = {"task", "task.name", "seed"}
 _NO_EFFECT = {"out", "root", "logger", "threads"}
 _LONGEST = 80
@@ -80,6 +82,8 @@ def variant(changes: Mapping[str, str], without: frozenset[str] = frozenset()) -
 def out_folder(recipe: str, config: Any, changes: Mapping[str, str]) -> Path:
     """The run's folder: ``out`` where it is given, else ``root/recipe/task/variant/seedN``.
 
+    An expert's is ``root/expert/task/hash`` instead.
+
     Args:
         recipe: the recipe's name.
         config: an instance of its ``Config``.
@@ -93,6 +97,9 @@ def out_folder(recipe: str, config: Any, changes: Mapping[str, str]) -> Path:
     """
     if config.out is not None:
         return Path(config.out)
+    if isinstance(config, ExpertRunConfig):
+        # Other recipes look for an expert by its settings, however they were arrived at.
+        return Path(config.root) / safe(recipe) / safe(config.task.name) / config_hash(config)
     # The folder of a task that is named after its environment names the environment already.
     named = frozenset({"task.env_id"} if config.task.name == config.task.env_id else ())
     place = Path(config.root) / safe(recipe) / safe(config.task.name)

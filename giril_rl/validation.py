@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import fields, is_dataclass
 from typing import Any
 
-from giril_rl.configs import DemoConfig, PPOConfig
+from giril_rl.configs import DemoConfig, ExpertConfig, PPOConfig, RunConfig
 from giril_rl.errors import UserError
 from giril_rl.schema import leaves
 
@@ -41,6 +41,26 @@ def _check_ppo(key: str, ppo: PPOConfig) -> None:
             f"{key}.minibatch={ppo.minibatch} does not divide {key}.num_envs * {key}.rollout "
             f"= {ppo.num_envs} * {ppo.rollout} = {batch}: choose one that does."
         )
+
+
+def _check_steps(key: str, steps: int, ppo: PPOConfig) -> None:
+    batch = ppo.num_envs * ppo.rollout
+    if steps % batch:
+        lower = steps // batch * batch
+        near = f"{lower} or {lower + batch}" if lower else str(batch)
+        raise UserError(
+            f"{key}={steps} is no whole number of batches of {ppo.num_envs} * {ppo.rollout} = "
+            f"{batch} steps (ppo.num_envs * ppo.rollout): give {near}."
+        )
+
+
+def _check_run(config: Any) -> None:
+    if isinstance(config, RunConfig):
+        _check_steps("steps", config.steps, config.ppo)
+    expert = getattr(config, "expert", None)
+    if isinstance(expert, ExpertConfig) and expert.path is None:
+        # The expert that another recipe trains has the settings of PPO that are the default.
+        _check_steps("expert.steps", expert.steps, PPOConfig())
 
 
 def _check_demo(key: str, demo: DemoConfig) -> None:
@@ -111,3 +131,4 @@ def validate(config: Any) -> None:
                 words = f"{each} must be {_range(leaf.metadata)}"
                 raise UserError(f"{leaf.key}={_show(value)}{words}.")
     _check_parts(config)
+    _check_run(config)

@@ -10,8 +10,8 @@ from torchrl.envs import Compose
 from giril_rl.configs import RunConfig, ScalingConfig, knob
 from giril_rl.envs import make_env
 from giril_rl.rewards import ConstantReward
-from giril_rl.training import Run, finish_run, make_agent, train_ppo
-from giril_rl.transforms import IntrinsicReward, ReturnScaling
+from giril_rl.training import Run, finish_run, make_agent, return_scaling, train_ppo
+from giril_rl.transforms import IntrinsicReward
 
 
 @dataclass
@@ -30,13 +30,9 @@ def main(cfg: Config, out: Path) -> None:
         if run.finished:
             return
         env = make_env(cfg.task, cfg.ppo.num_envs, cfg.seed)
-        relabel = [IntrinsicReward(ConstantReward())]
-        if cfg.scaling.enabled:
-            relabel.append(
-                ReturnScaling(cfg.ppo.gamma, reset=cfg.scaling.reset, clip=cfg.scaling.clip)
-            )
-        agent = make_agent(env, cfg.ppo, cfg.seed)
-        trained = train_ppo(
-            env, agent, Compose(*relabel), cfg.ppo, steps=cfg.steps, seed=cfg.seed, run=run
+        relabel = Compose(
+            IntrinsicReward(ConstantReward()), *return_scaling(cfg.scaling, cfg.ppo.gamma)
         )
+        agent = make_agent(env, cfg.ppo, cfg.seed)
+        trained = train_ppo(env, agent, relabel, cfg.ppo, steps=cfg.steps, seed=cfg.seed, run=run)
         finish_run(run, cfg, agent, trained, method=f"control:{cfg.reward}")

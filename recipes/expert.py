@@ -6,17 +6,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from giril_rl.configs import ExpertRunConfig
-from giril_rl.training import expert_folder, train_expert
+from giril_rl.training import train_expert
 
 
 @dataclass
 class Config(ExpertRunConfig):
     """What `giril run expert` takes."""
-
-
-def default_out(cfg: Config) -> Path:
-    """Where the other recipes look for an expert of these settings."""
-    return expert_folder(cfg)
 
 
 def main(cfg: Config, out: Path) -> None:

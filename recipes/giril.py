@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import cast
 
 from torchrl.envs import Compose
 
@@ -20,16 +21,17 @@ from giril_rl.configs import (
 )
 from giril_rl.demos import holdout, subsample
 from giril_rl.envs import make_env
-from giril_rl.rewards import GenerativeReward, GenerativeRewardLoss
+from giril_rl.rewards import GenerativeReward, GenerativeRewardLoss, Prior, ScalingRule
 from giril_rl.training import (
     Run,
     finish_run,
     fit_reward,
     make_agent,
     obtain_demonstration,
+    return_scaling,
     train_ppo,
 )
-from giril_rl.transforms import BatchMeanReward, IntrinsicReward, ReturnScaling
+from giril_rl.transforms import BatchMeanReward, IntrinsicReward
 
 
 @dataclass
@@ -58,8 +60,8 @@ def main(cfg: Config, out: Path) -> None:
             hidden=cfg.reward.hidden,
             beta=cfg.reward.beta,
             scale=cfg.reward.scale,
-            prior=cfg.reward.prior,
-            normalise=cfg.reward.normalise,
+            prior=cast(Prior, cfg.reward.prior),
+            normalise=cast(ScalingRule, cfg.reward.normalise),
             clamp=cfg.reward.clamp,
             seed=reward_seed,
         )
@@ -73,17 +75,13 @@ def main(cfg: Config, out: Path) -> None:
             held_out=holdout(demo, cfg.demo.subsample),
         )
 
-        relabel = [IntrinsicReward(reward)]
-        if cfg.batch_mean:
-            relabel.append(BatchMeanReward())
-        if cfg.scaling.enabled:
-            relabel.append(
-                ReturnScaling(cfg.ppo.gamma, reset=cfg.scaling.reset, clip=cfg.scaling.clip)
-            )
-        agent = make_agent(env, cfg.ppo, cfg.seed)
-        trained = train_ppo(
-            env, agent, Compose(*relabel), cfg.ppo, steps=cfg.steps, seed=cfg.seed, run=run
+        relabel = Compose(
+            IntrinsicReward(reward),
+            *([BatchMeanReward()] if cfg.batch_mean else []),
+            *return_scaling(cfg.scaling, cfg.ppo.gamma),
         )
+        agent = make_agent(env, cfg.ppo, cfg.seed)
+        trained = train_ppo(env, agent, relabel, cfg.ppo, steps=cfg.steps, seed=cfg.seed, run=run)
         finish_run(
             run,
             cfg,

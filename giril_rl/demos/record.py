@@ -14,6 +14,7 @@ from torch import Tensor
 from giril_rl.demos.check import check_demonstration
 from giril_rl.demos.demonstration import Demonstration
 from giril_rl.demos.replay import as_executed, as_recorded, verify_by_replay
+from giril_rl.envs.vector import silent_stdout
 from giril_rl.errors import UserError
 from giril_rl.files import installed_versions
 from giril_rl.progress import progress
@@ -129,7 +130,8 @@ def _play(
 ) -> list[dict[str, Any]]:
     """One episode from ``seed``, or its first ``most`` transitions."""
     rows: list[dict[str, Any]] = []
-    observation, _ = env.reset(seed=seed)
+    with silent_stdout():  # the simulator connects here
+        observation, _ = env.reset(seed=seed)
     before = as_recorded(observation)
     while len(rows) < most:
         action = _choose(policy, before, env.action_space)

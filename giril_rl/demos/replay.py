@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import gymnasium
 import numpy as np
 
+from giril_rl.envs.vector import silent_stdout
 from giril_rl.errors import UserError
 
 if TYPE_CHECKING:
@@ -77,7 +78,8 @@ def verify_by_replay(
     for seed, length in zip(seeds, demo.lengths.tolist(), strict=True):
         env = make_fn()
         try:
-            observation, _ = env.reset(seed=int(seed))
+            with silent_stdout():  # the simulator connects here
+                observation, _ = env.reset(seed=int(seed))
             _compare(
                 "reset", index, data["observation"][index], as_recorded(observation), tolerance
             )

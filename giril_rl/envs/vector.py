@@ -111,18 +111,18 @@ class GymVectorEnv(EnvBase):
             ends.append(terminated)
             cuts.append(truncated)
         self._steps += 1
-        terminated = np.array(ends, dtype=bool)
-        truncated = np.array(cuts, dtype=bool)
+        failed = np.array(ends, dtype=bool)
+        cut = np.array(cuts, dtype=bool)
         if self._limit is not None:
-            truncated |= self._steps >= self._limit
+            cut |= self._steps >= self._limit
         self._last_observation = observation
         return TensorDict(
             {
                 "observation": torch.from_numpy(observation),
                 "reward": torch.from_numpy(reward),
-                "done": torch.from_numpy(terminated | truncated).unsqueeze(-1),
-                "terminated": torch.from_numpy(terminated).unsqueeze(-1),
-                "truncated": torch.from_numpy(truncated).unsqueeze(-1),
+                "done": torch.from_numpy(failed | cut).unsqueeze(-1),
+                "terminated": torch.from_numpy(failed).unsqueeze(-1),
+                "truncated": torch.from_numpy(cut).unsqueeze(-1),
             },
             batch_size=self.batch_size,
         )
@@ -171,7 +171,7 @@ class GymVectorEnv(EnvBase):
     def _reset_where(self, mask: np.ndarray) -> np.ndarray:
         observation = self._last_observation.copy()
         with silent_stdout() if not self._started else contextlib.nullcontext():
-            for i in np.flatnonzero(mask):
+            for i in np.flatnonzero(mask).tolist():
                 observation[i], _ = self._gym_envs[i].reset(seed=self._episode_seed(i))
                 self._episode[i] += 1
                 self._steps[i] = 0
@@ -181,7 +181,7 @@ class GymVectorEnv(EnvBase):
         return observation
 
     def _episode_seed(self, index: int) -> int:
-        entropy = [self._root_seed, int(index), int(self._episode[index])]
+        entropy = [self._root_seed, index, int(self._episode[index])]
         return int(np.random.SeedSequence(entropy).generate_state(1)[0])
 
     def _set_seed(self, seed: int | None) -> None:

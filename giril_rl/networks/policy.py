@@ -33,6 +33,7 @@ class ActorCritic(nn.Module):
         normalise: whether observations are normalised with running statistics.
 
     Examples:
+        >>> from tensordict import TensorDict
         >>> from torchrl.data import Categorical
         >>> agent = ActorCritic(4, Categorical(2, shape=(1,)))
         >>> policy = agent.acting()

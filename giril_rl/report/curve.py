@@ -96,12 +96,19 @@ def write_curve(
     else:
         axes.text(0.5, 0.5, "no training episode ended", ha="center", transform=axes.transAxes)
     for value, style, name in (
-        (expert_return, "--", "expert"),
+        (expert_return, "-", "expert"),
         (demo_return, ":", "demonstration"),
     ):
         if value is not None:
-            colour = "tab:green" if name == "expert" else "tab:gray"
-            axes.axhline(value, linestyle=style, color=colour, label=f"{name} ({value:,.1f})")
+            # The two are often equal: dots drawn over a thin line leave both to be seen.
+            expert = name == "expert"
+            axes.axhline(
+                value,
+                linestyle=style,
+                linewidth=1.2 if expert else 2.4,
+                color="tab:green" if expert else "tab:orange",
+                label=f"{name} ({value:,.1f})",
+            )
     if final_return is not None:
         where = final_step if final_step is not None else (points[-1][0] if points else 0)
         axes.errorbar(

@@ -4,6 +4,7 @@ from giril_rl.rewards.actions import ActionEncoder
 from giril_rl.rewards.constant import ConstantReward
 from giril_rl.rewards.generative import (
     GenerativeReward,
+    Prior,
     blend_action,
     reconstruction_error,
 )
@@ -12,7 +13,7 @@ from giril_rl.rewards.generative_loss import (
     action_term,
     gaussian_kl,
 )
-from giril_rl.rewards.scaler import ObservationScaler
+from giril_rl.rewards.scaler import ObservationScaler, ScalingRule
 
 __all__ = [
     "ActionEncoder",
@@ -20,6 +21,8 @@ __all__ = [
     "GenerativeReward",
     "GenerativeRewardLoss",
     "ObservationScaler",
+    "Prior",
+    "ScalingRule",
     "action_term",
     "blend_action",
     "gaussian_kl",

@@ -2,11 +2,12 @@
 
 from giril_rl.training.agent import load_agent, make_agent, save_agent
 from giril_rl.training.evaluate import Scores, evaluate, evaluate_both
-from giril_rl.training.expert import expert_folder, obtain_demonstration, train_expert
+from giril_rl.training.expert import obtain_demonstration, train_expert
 from giril_rl.training.fit import fit_reward
 from giril_rl.training.ppo import PPOLearner, train_ppo
 from giril_rl.training.result import finish_run
 from giril_rl.training.run import Run
+from giril_rl.training.scaling import return_scaling
 
 __all__ = [
     "PPOLearner",
@@ -14,12 +15,12 @@ __all__ = [
     "Scores",
     "evaluate",
     "evaluate_both",
-    "expert_folder",
     "finish_run",
     "fit_reward",
     "load_agent",
     "make_agent",
     "obtain_demonstration",
+    "return_scaling",
     "save_agent",
     "train_expert",
     "train_ppo",

@@ -11,35 +11,24 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-import torch
 from filelock import FileLock, Timeout
 from tensordict import TensorDict
 from torch import Tensor
+from torchrl.envs import Compose
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from giril_rl.configs import DemoConfig, ExpertConfig, ExpertRunConfig, RunConfig, TaskConfig
+from giril_rl.configs import DemoConfig, ExpertConfig, ExpertRunConfig, RunConfig
 from giril_rl.demos import Demonstration, check_demonstration, record_demonstration
 from giril_rl.envs import gym_factory, make_env
 from giril_rl.errors import UserError
-from giril_rl.naming import config_hash, safe
+from giril_rl.naming import out_folder, safe
 from giril_rl.networks.policy import ActorCritic
-from giril_rl.training.agent import load_agent, make_agent, save_agent
-from giril_rl.training.ppo import train_ppo
+from giril_rl.training.agent import load_agent, make_agent
 from giril_rl.training.finished import read_result, read_settings
+from giril_rl.training.ppo import train_ppo
 from giril_rl.training.result import finish_run
 from giril_rl.training.run import Run
-from giril_rl.transforms import ReturnScaling
-
-
-def expert_folder(cfg: ExpertRunConfig) -> Path:
-    """Where an expert of these settings is kept: ``root/expert/task/hash``.
-
-    Examples:
-        >>> task = TaskConfig(name="cartpole", env_id="CartPole-v1")
-        >>> expert_folder(ExpertRunConfig(task=task)).parent.as_posix()
-        'runs/expert/cartpole'
-    """
-    return Path(cfg.root) / "expert" / safe(cfg.task.name) / config_hash(cfg)
+from giril_rl.training.scaling import return_scaling
 
 
 def train_expert(cfg: ExpertRunConfig, folder: Path) -> dict[str, Any]:
@@ -60,17 +49,10 @@ def train_expert(cfg: ExpertRunConfig, folder: Path) -> dict[str, Any]:
             return run.result
         env = make_env(cfg.task, cfg.ppo.num_envs, cfg.seed)
         agent = make_agent(env, cfg.ppo, cfg.seed)
-        relabel: Any = torch.nn.Identity()
-        if cfg.scaling.enabled:
-            relabel = ReturnScaling(
-                cfg.ppo.gamma,
-                reset=cfg.scaling.reset,  # type: ignore[arg-type]
-                clip=cfg.scaling.clip,
-            )
         trained = train_ppo(
             env,
             agent,
-            relabel,
+            Compose(*return_scaling(cfg.scaling, cfg.ppo.gamma)),
             cfg.ppo,
             steps=cfg.steps,
             seed=cfg.seed,
@@ -109,7 +91,7 @@ def obtain_expert(cfg: RunConfig, expert: ExpertConfig) -> tuple[Path, dict[str,
         seed=expert.seed,
         stop_early=expert.stop_early,
     )
-    folder = expert_folder(settings)
+    folder = out_folder("expert", settings, {})
     with made_once(folder, "expert"):
         return folder, train_expert(settings, folder)
 

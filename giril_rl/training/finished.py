@@ -25,7 +25,9 @@ def read_result(folder: Path) -> dict[str, Any]:
     """
     path = folder / "result.json"
     if not path.exists():
-        raise UserError(f"{folder} holds no finished run (no result.json): run it to its end first.")
+        raise UserError(
+            f"{folder} holds no finished run (no result.json): run it to its end first."
+        )
     return read_json(path)
 
 
@@ -70,6 +72,18 @@ def evaluate_run(folder: Path, episodes: int | None = None, seed: int | None = N
     print(f"{task.name}, {episodes} episodes each, evaluation seed {seed}")
     print(describe("deterministic", scores))
     print(describe("sampled", scores["sampled"]))  # type: ignore[arg-type]
+
+
+def print_scores(folder: Path) -> None:
+    """Prints a finished run's scores, beside its expert's and its demonstration's."""
+    result = read_result(folder)
+    print(f"{result['method']} on {result['task']}: {result['env_steps']:,} steps, {folder}")
+    for who in ("expert", "demo"):
+        score = result.get(f"{who}_return_mean")
+        if score is not None:
+            print(f"{who:<14} return {score:,.1f}")
+    print(describe("deterministic", result))
+    print(describe("sampled", result["sampled"]))
 
 
 def describe(kind: str, scores: dict[str, Any]) -> str:

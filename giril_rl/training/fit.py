@@ -100,4 +100,3 @@ def _evaluate(loss: nn.Module, sets: dict[str, TensorDictBase | None]) -> dict[s
             for key, value in loss(data).items():
                 values[f"fit/{name}/{str(key).removeprefix('loss_')}"] = value.item()
     return values
-

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable
 from typing import TYPE_CHECKING, NamedTuple
 
 import torch
@@ -17,9 +16,9 @@ from torchrl.objectives.value import GAE
 from giril_rl.configs import PPOConfig
 from giril_rl.envs.vector import GymVectorEnv
 from giril_rl.networks.policy import NORMALISED, ActorCritic
+from giril_rl.progress import progress
 from giril_rl.training.episodes import EpisodeTracker
 from giril_rl.training.interrupt import Interrupt, Interrupted
-from giril_rl.progress import progress
 from giril_rl.training.traced import TracedGradients
 
 if TYPE_CHECKING:
@@ -44,7 +43,7 @@ class Trained(NamedTuple):
 def train_ppo(
     env: GymVectorEnv,
     agent: ActorCritic,
-    relabel: Callable[[TensorDictBase], TensorDictBase],
+    relabel: nn.Module,
     cfg: PPOConfig,
     *,
     steps: int,
@@ -63,7 +62,7 @@ def train_ppo(
         env: the training environments.
         agent: policy and value network.
         relabel: a transform or a composition of them, called with each batch ``(num_envs, time)``;
-            whatever it holds in its ``state_dict`` is checkpointed.
+            its ``state_dict`` is checkpointed.
         cfg: settings of PPO.
         steps: environment steps in all, a multiple of ``cfg.num_envs * cfg.rollout``.
         seed: seeds action sampling and minibatch order.
@@ -81,9 +80,7 @@ def train_ppo(
     learner = PPOLearner(agent, cfg, total_steps=steps)
     tracker = EpisodeTracker(cfg.num_envs)
     recent: deque[float] = deque(maxlen=20)
-    parts = nn.ModuleDict({"agent": agent, "tracker": tracker})
-    if isinstance(relabel, nn.Module):
-        parts["relabel"] = relabel
+    parts = nn.ModuleDict({"agent": agent, "tracker": tracker, "relabel": relabel})
     taken = 0
     saved = run.load(phase)
     if saved is not None:

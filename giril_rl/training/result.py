@@ -56,7 +56,7 @@ def finish_run(
         "wall_seconds": trained.seconds,
         "steps_per_second": trained.steps / max(trained.seconds, 1e-9),
         "expert_return_mean": None if expert is None else expert["return_mean"],
-        "demo_return_mean": None if demo is None else demo.returns.mean().item(),
+        "demo_return_mean": None if demo is None else _mean_return(demo),
         "demo_transitions": None if demo is None else len(demo),
         "config_hash": config_hash(cfg),
         "versions": run.versions,
@@ -76,3 +76,11 @@ def finish_run(
     )
     run.finish(result)
     return result
+
+
+def _mean_return(demo: Demonstration) -> float:
+    """Mean over whole episodes; a cut one counts only where there is no other."""
+    returns = demo.returns
+    if not demo.transitions["next", "done"][-1] and len(returns) > 1:
+        returns = returns[:-1]
+    return returns.mean().item()

@@ -97,7 +97,7 @@ class TracedGradients:
             with torch.enable_grad():
                 leaves = [p.detach().requires_grad_() for p in tensors[:count]]
                 values = dict(zip(self._keys, tensors[count:], strict=True))
-                batch = TensorDict(values, inputs[0].shape[:1])  # type: ignore[arg-type]
+                batch = TensorDict(values, inputs[0].shape[:1])
                 parameters = dict(zip(self._names, leaves, strict=True))
                 out = torch.func.functional_call(self._loss, parameters, (batch,))
                 losses = {k: v for k, v in out.items() if str(k).startswith("loss_")}
