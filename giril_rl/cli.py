@@ -8,6 +8,7 @@ are imported only by the commands that need them.
 from __future__ import annotations
 
 import argparse
+import os
 import sys
 import traceback
 from collections.abc import Callable, Mapping, Sequence
@@ -190,8 +191,12 @@ def main(argv: Sequence[str] | None = None) -> int:
             raise UserError(f"{words[0]!r} is not a command{hint}")
         return _COMMANDS[words[0]][0](words[1:])
     except KeyboardInterrupt as interrupt:
-        print(f"giril: {interrupt or 'interrupted'}.", file=sys.stderr)
+        print(f"giril: {str(interrupt) or 'interrupted'}.", file=sys.stderr)
         return 130
+    except BrokenPipeError:
+        # The reader, such as `head`, has seen enough; nothing may be flushed into its pipe again.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
     except Exception as error:
         return _report(error, show_traceback)
 

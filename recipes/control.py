@@ -8,7 +8,7 @@ from pathlib import Path
 from torchrl.envs import Compose
 
 from giril_rl.configs import RunConfig, ScalingConfig, knob
-from giril_rl.envs import make_env
+from giril_rl.envs import gym_factory, make_env
 from giril_rl.rewards import ConstantReward
 from giril_rl.training import Run, finish_run, make_agent, return_scaling, train_ppo
 from giril_rl.transforms import IntrinsicReward
@@ -26,6 +26,7 @@ class Config(RunConfig):
 
 def main(cfg: Config, out: Path) -> None:
     """Train a policy on the control reward and leave its run folder in ``out``."""
+    gym_factory(cfg.task)  # Refuses an unknown environment before a folder is made.
     with Run.open(out, asdict(cfg), recipe="control", logger=cfg.logger) as run:
         if run.finished:
             return

@@ -24,6 +24,7 @@ from giril_rl.envs import make_env
 from giril_rl.rewards import GenerativeReward, GenerativeRewardLoss, Prior, ScalingRule
 from giril_rl.training import (
     Run,
+    check_inputs,
     finish_run,
     fit_reward,
     make_agent,
@@ -47,6 +48,7 @@ class Config(RunConfig):
 
 def main(cfg: Config, out: Path) -> None:
     """Train the whole chain and leave its run folder in ``out``."""
+    check_inputs(cfg, cfg.expert, cfg.demo)
     with Run.open(out, asdict(cfg), recipe="giril", logger=cfg.logger) as run:
         if run.finished:
             return

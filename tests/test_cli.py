@@ -45,7 +45,7 @@ defaults:
   - task: inverted_pendulum
   - profile: released
   - _self_
-steps: 100
+steps: 20000
 """
 
 
@@ -213,7 +213,7 @@ def test_a_folder_with_odd_characters_is_no_obstacle(fake, tmp_path, monkeypatch
         (folder / name).write_text((tmp_path / name).read_text())
     monkeypatch.chdir(folder)
     assert main(["run", str(folder / "fake.py"), "out=o"]) == 0
-    assert read("o")["steps"] == 100
+    assert read("o")["steps"] == 20000
 
 
 @pytest.mark.parametrize(
@@ -287,9 +287,9 @@ def test_eval_hands_its_arguments_on(tmp_path, monkeypatch):
     import types
 
     calls = []
-    module = types.ModuleType("giril_rl.training.evaluate")
+    module = types.ModuleType("giril_rl.training.finished")
     module.evaluate_run = lambda *arguments: calls.append(arguments)
-    monkeypatch.setitem(sys.modules, "giril_rl.training.evaluate", module)
+    monkeypatch.setitem(sys.modules, "giril_rl.training.finished", module)
     assert main(["eval", str(tmp_path), "--episodes", "3"]) == 0
     assert main(["eval", str(tmp_path), "--seed", "0"]) == 0
     assert calls == [(tmp_path, 3, None), (tmp_path, None, 0)]

@@ -47,8 +47,8 @@ def test_tasks(task, env_id, steps, score):
 
 
 def test_steps_follow_the_task_unless_given():
-    assert config_of("task.steps=7").steps == 7
-    assert config_of("steps=9", "task=inverted_double_pendulum").steps == 9
+    assert config_of("task.steps=70000").steps == 70000
+    assert config_of("steps=90000", "task=inverted_double_pendulum").steps == 90000
 
 
 def test_expert_trains_for_five_million_steps():

@@ -5,6 +5,7 @@ import pytest
 
 from giril_rl.configs import (
     DemoConfig,
+    ExpertConfig,
     FitConfig,
     GenerativeConfig,
     PPOConfig,
@@ -26,7 +27,7 @@ class Config(RunConfig):
 
 
 def good() -> Config:
-    return Config(task=TaskConfig(name="reach", env_id="Reach-v0"), steps=1000)
+    return Config(task=TaskConfig(name="reach", env_id="Reach-v0"), steps=10_000)
 
 
 def test_defaults_pass():
@@ -97,11 +98,34 @@ def test_bounds_and_null_pass(key, value):
 def test_minibatch_divides_the_batch(num_envs, rollout, minibatch, fits):
     config = good()
     config.ppo = PPOConfig(num_envs=num_envs, rollout=rollout, minibatch=minibatch)
+    config.steps = 10 * num_envs * rollout
     if fits:
         validate(config)
     else:
         with pytest.raises(UserError, match=rf"ppo\.minibatch={minibatch} does not divide"):
             validate(config)
+
+
+@pytest.mark.parametrize(
+    ("steps", "near"), [(9_999, "give 10000"), (15_000, "give 10000 or 20000")]
+)
+def test_steps_are_whole_batches(steps, near):
+    config = good()
+    config.steps = steps
+    with pytest.raises(UserError, match=rf"steps={steps} is no whole number .*: {near}\."):
+        validate(config)
+
+
+def test_steps_of_the_expert_are_whole_batches():
+    @dataclass
+    class WithExpert(RunConfig):
+        expert: ExpertConfig = field(default_factory=lambda: ExpertConfig(steps=12_345))
+
+    config = WithExpert(task=TaskConfig(name="reach", env_id="Reach-v0"), steps=10_000)
+    with pytest.raises(UserError, match=r"expert\.steps=12345 is no whole number"):
+        validate(config)
+    config.expert.path = "somewhere"
+    validate(config)
 
 
 @pytest.mark.parametrize(

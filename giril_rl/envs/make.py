@@ -45,14 +45,16 @@ def gym_factory(task: TaskConfig) -> Callable[[], gymnasium.Env]:
         )
 
     def make() -> gymnasium.Env:
+        # pybullet prints on both streams, when imported and whenever it connects, at a first reset.
+        bullet = BULLET in task.env_id
         try:
-            env = gymnasium.make(task.env_id, max_episode_steps=limit, disable_env_checker=True)
-            if BULLET in task.env_id:
-                with silent_stdout():
-                    env.reset()  # Now, for pybullet prints whenever it connects.
-            return env
+            with silent_stdout(stderr=True) if bullet else contextlib.nullcontext():
+                env = gymnasium.make(task.env_id, max_episode_steps=limit, disable_env_checker=True)
+                if bullet:
+                    env.reset()
         except gymnasium.error.DependencyNotInstalled as error:
             raise UserError(f"{task.env_id} needs another package: {error}") from None
+        return env
 
     return make
 
@@ -77,10 +79,9 @@ def make_env(task: TaskConfig, num_envs: int, seed: int) -> GymVectorEnv:
 
 
 def _import(package: str) -> None:
-    with silent_stdout(), contextlib.suppress(AttributeError):
-        try:
-            importlib.import_module(package)
-        except ImportError:
-            raise UserError(
-                f"this task needs {package}, which is not installed: pip install {package}."
-            ) from None
+    try:
+        importlib.import_module(package)
+    except ImportError:
+        raise UserError(
+            f"this task needs {package}, which is not installed: pip install {package}."
+        ) from None

@@ -67,6 +67,7 @@ class GymVectorEnv(EnvBase):
                 env, limit = without_bookkeeping(make_fn())
                 self._limit = self._limit or limit
                 self._gym_envs.append(env)
+        self.is_closed = False  # EnvBase says True where no wrapper says otherwise.
         self._root_seed = seed
         self._episode = np.zeros(num_envs, dtype=np.int64)
         self._steps = np.zeros(num_envs, dtype=np.int64)
@@ -267,18 +268,26 @@ def without_bookkeeping(env: gymnasium.Env) -> tuple[gymnasium.Env, int | None]:
 
 
 @contextlib.contextmanager
-def silent_stdout() -> Iterator[None]:
-    """Drops what C code prints on standard output, as pybullet does whenever it connects."""
-    sys.stdout.flush()
-    saved = os.dup(1)
+def silent_stdout(*, stderr: bool = False) -> Iterator[None]:
+    """Drops what C code prints on standard output, as pybullet does whenever it connects.
+
+    Args:
+        stderr: drop what is printed on standard error as well, as pybullet does when imported.
+    """
+    streams = [sys.stdout, sys.stderr] if stderr else [sys.stdout]
+    for stream in streams:
+        stream.flush()
+    saved = [os.dup(descriptor) for descriptor in range(1, len(streams) + 1)]
     null = os.open(os.devnull, os.O_WRONLY)
     try:
-        os.dup2(null, 1)
+        for descriptor in range(1, len(streams) + 1):
+            os.dup2(null, descriptor)
         yield
     finally:
-        sys.stdout.flush()
-        os.dup2(saved, 1)
-        os.close(saved)
+        for descriptor, (stream, kept) in enumerate(zip(streams, saved, strict=True), 1):
+            stream.flush()
+            os.dup2(kept, descriptor)
+            os.close(kept)
         os.close(null)
 
 

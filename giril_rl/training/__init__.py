@@ -2,7 +2,7 @@
 
 from giril_rl.training.agent import load_agent, make_agent, save_agent
 from giril_rl.training.evaluate import Scores, evaluate, evaluate_both
-from giril_rl.training.expert import obtain_demonstration, train_expert
+from giril_rl.training.expert import check_inputs, obtain_demonstration, train_expert
 from giril_rl.training.fit import fit_reward
 from giril_rl.training.ppo import PPOLearner, train_ppo
 from giril_rl.training.result import finish_run
@@ -13,6 +13,7 @@ __all__ = [
     "PPOLearner",
     "Run",
     "Scores",
+    "check_inputs",
     "evaluate",
     "evaluate_both",
     "finish_run",

@@ -17,7 +17,7 @@ from torch import Tensor
 from torchrl.envs import Compose
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from giril_rl.configs import DemoConfig, ExpertConfig, ExpertRunConfig, RunConfig
+from giril_rl.configs import DemoConfig, ExpertConfig, ExpertRunConfig, RunConfig, TaskConfig
 from giril_rl.demos import Demonstration, check_demonstration, record_demonstration
 from giril_rl.envs import gym_factory, make_env
 from giril_rl.errors import UserError
@@ -44,6 +44,7 @@ def train_expert(cfg: ExpertRunConfig, folder: Path) -> dict[str, Any]:
     Raises:
         Interrupted: after a checkpoint, if the user asked for it with Ctrl-C.
     """
+    gym_factory(cfg.task)  # Refuses an unknown environment before a folder is made.
     with Run.open(folder, asdict(cfg), recipe="expert", logger=cfg.logger) as run:
         if run.result is not None:
             return run.result
@@ -96,6 +97,32 @@ def obtain_expert(cfg: RunConfig, expert: ExpertConfig) -> tuple[Path, dict[str,
         return folder, train_expert(settings, folder)
 
 
+def check_inputs(cfg: RunConfig, expert: ExpertConfig, demo: DemoConfig) -> None:
+    """Looks at whatever a recipe was given by its path, before its run's folder is made.
+
+    Raises:
+        UserError: if the task, the expert or the demonstration is not what it should be.
+    """
+    if demo.path is not None:
+        _given_demonstration(cfg.task, demo.path)
+    elif expert.path is not None:
+        obtain_expert(cfg, expert)
+    else:
+        gym_factory(cfg.task)
+
+
+def _given_demonstration(task: TaskConfig, path: str) -> Demonstration:
+    env = make_env(task, 1, seed=0)
+    shape, spec = env.observation_spec["observation"].shape, env.action_spec
+    env.close()
+    demo = Demonstration.load(path)
+    try:
+        check_demonstration(demo, shape[-1], spec)
+    except UserError as error:
+        raise UserError(f"demo.path={path} does not fit {task.name}: {error}") from None
+    return demo
+
+
 def obtain_demonstration(
     cfg: RunConfig, expert: ExpertConfig, demo: DemoConfig
 ) -> tuple[Demonstration, dict[str, Any] | None]:
@@ -106,13 +133,8 @@ def obtain_demonstration(
     Raises:
         UserError: if the demonstration does not fit the task.
     """
-    env = make_env(cfg.task, 1, seed=0)
-    shape, spec = env.observation_spec["observation"].shape, env.action_spec
-    env.close()
     if demo.path is not None:
-        found = Demonstration.load(demo.path)
-        check_demonstration(found, shape[-1], spec)
-        return found, None
+        return _given_demonstration(cfg.task, demo.path), None
     source, result = obtain_expert(cfg, expert)
     settings = {k: v for k, v in asdict(demo).items() if k not in ("path", "subsample")}
     identity = json.dumps([settings, asdict(cfg.task), result["config_hash"]], sort_keys=True)

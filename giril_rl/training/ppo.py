@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from tensordict import TensorDictBase
@@ -168,8 +168,12 @@ class PPOLearner:
         self.cfg = cfg
         self.total_steps = total_steps
         critic = agent.critic_for_loss()
-        self.advantage = GAE(gamma=cfg.gamma, lmbda=cfg.lmbda, value_network=critic)
-        loss = ClipPPOLoss(
+        # Standardised over the whole batch, not per minibatch: a minibatch without any event would
+        # have its noise blown up to unit variance, and the policy would follow it.
+        self.advantage = GAE(
+            gamma=cfg.gamma, lmbda=cfg.lmbda, value_network=critic, average_gae=True
+        )
+        loss = RecordableClipPPOLoss(
             agent.actor_for_loss(),
             critic,
             clip_epsilon=cfg.clip,
@@ -177,7 +181,7 @@ class PPOLearner:
             entropy_coeff=cfg.entropy_coef,
             critic_coeff=cfg.value_coef,
             loss_critic_type="l2",
-            normalize_advantage=True,
+            normalize_advantage=False,
             log_explained_variance=False,
             functional=False,
         )
@@ -219,3 +223,14 @@ class PPOLearner:
                 self.optimizer.step()
         self.agent.update_normaliser(batch.get("observation"))
         return {k: torch.stack([log[k] for log in logs]).mean().item() for k in logs[0]}
+
+
+class RecordableClipPPOLoss(ClipPPOLoss):
+    """:class:`torchrl.objectives.ClipPPOLoss` for distributions that know their entropy.
+
+    TorchRL looks whether the entropy is finite and estimates it from samples where it is not, which
+    a recorded graph cannot decide anew at each call.
+    """
+
+    def _get_entropy(self, dist: Any, adv_shape: torch.Size) -> torch.Tensor:
+        return dist.entropy().unsqueeze(-1)

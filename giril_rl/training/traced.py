@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Sequence
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
-from torch.fx.experimental.proxy_tensor import make_fx
+
+from giril_rl.networks.recorded import record
 
 
 class TracedGradients:
@@ -115,14 +115,7 @@ class TracedGradients:
             names[:] = [*losses, *logged]
             return (*gradients, *(v.detach() for v in losses.values()), *logged.values())
 
-        rng = torch.get_rng_state()
-        graph = make_fx(losses_and_gradients)(*self._data, *inputs)
-        graph.graph.eliminate_dead_code()
-        graph.recompile()
-        with torch.no_grad(), warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # Tracing a recorded graph has nothing to warn of.
-            function = torch.jit.trace(graph, (*self._data, *inputs), check_trace=False)
-        torch.set_rng_state(rng)  # Recording must not consume the run's random numbers.
+        function = record(losses_and_gradients, [*self._data, *inputs])
         return function, list(names)
 
 

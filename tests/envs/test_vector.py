@@ -1,0 +1,353 @@
+import ctypes
+from functools import partial
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+from tensordict import TensorDict
+from torchrl.collectors import Collector
+from torchrl.envs import EnvBase
+from torchrl.envs.utils import check_env_specs
+
+from giril_rl.configs import TaskConfig
+from giril_rl.envs import GymVectorEnv, make_env
+from giril_rl.errors import UserError
+from giril_rl.training.checkpoint import load_state, save_state
+
+BULLET = "InvertedPendulumBulletEnv-v0"
+KEYS = ["observation", "action"] + [
+    ("next", name) for name in ("observation", "reward", "done", "terminated", "truncated")
+]
+
+
+def make(env_id, num_envs=3, *, seed=0, limit=None):
+    task = TaskConfig(name="test", env_id=env_id, max_episode_steps=limit)
+    return make_env(task, num_envs, seed)
+
+
+def random_actions(env, steps, seed=0):
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        return torch.stack([env.action_spec.rand() for _ in range(steps)])
+
+
+def play(env, actions, root=None, step=GymVectorEnv.step_and_maybe_reset):
+    """All transitions ``[N, T]`` and the root that would come next."""
+    root = env.reset() if root is None else root
+    steps = []
+    for action in actions:
+        transition, root = step(env, root.clone().set("action", action))
+        steps.append(transition.select(*KEYS).clone())
+    return torch.stack(steps, 1), root
+
+
+def gymnasium_loop(make_fn, actions, seed):
+    """The same with Gymnasium alone, one environment after the other."""
+    columns = {key: [] for key in KEYS}
+    for i in range(actions.shape[1]):
+        env, episode = make_fn(), 0
+
+        def episode_seed(i=i):
+            return int(np.random.SeedSequence([seed, i, episode]).generate_state(1)[0])  # noqa: B023
+
+        observation = env.reset(seed=episode_seed())[0].copy()
+        rows = {key: [] for key in KEYS}
+        for action in actions[:, i].numpy():
+            following, reward, terminated, truncated, _ = env.step(action)
+            done = terminated or truncated
+            following = following.copy()
+            values = (observation, action, following, reward, done, terminated, truncated)
+            for key, value in zip(KEYS, values, strict=True):
+                rows[key].append(value)
+            observation = following
+            if done:
+                episode += 1
+                observation = env.reset(seed=episode_seed())[0].copy()
+        env.close()
+        for key in KEYS:
+            columns[key].append(np.stack(rows[key]))
+    return {key: np.stack(value) for key, value in columns.items()}
+
+
+@pytest.mark.parametrize(
+    ("env_id", "limit"),
+    [("CartPole-v1", None), ("CartPole-v1", 14), ("Pendulum-v1", 7), (BULLET, 15)],
+)
+def test_equals_a_loop_over_gymnasium_environments(env_id, limit):
+    env = make(env_id, seed=5, limit=limit)
+    actions = random_actions(env, 80)
+    batch, _ = play(env, actions)
+    extra = {} if limit is None else {"max_episode_steps": limit}
+    expected = gymnasium_loop(partial(gymnasium.make, env_id, **extra), actions, seed=5)
+    for key in KEYS:
+        found = batch[key].numpy()
+        if key[-1] in ("reward", "done", "terminated", "truncated"):
+            found = found[..., 0]
+        np.testing.assert_array_equal(found, expected[key].astype(found.dtype), err_msg=str(key))
+    assert batch["next", "done"].sum() >= 9  # Otherwise little was compared.
+    if limit is not None:
+        assert batch["next", "truncated"].any()
+    env.close()
+
+
+@pytest.mark.parametrize(
+    ("env_id", "limit"), [("CartPole-v1", 14), ("Pendulum-v1", 7), ("StepCounter-v0", None)]
+)
+def test_equals_the_general_step_of_torchrl(env_id, limit):
+    env, other = make(env_id, limit=limit), make(env_id, limit=limit)
+    actions = random_actions(env, 40)
+    batch, root = play(env, actions)
+    expected, expected_root = play(other, actions, step=EnvBase.step_and_maybe_reset)
+    assert expected["next", "done"].any()
+    for key in KEYS:
+        assert torch.equal(batch[key], expected[key]), key
+    for key in ("observation", "done", "terminated", "truncated"):
+        assert torch.equal(root[key], expected_root[key]), key
+
+
+@pytest.mark.parametrize("env_id", ["Pendulum-v1", "CartPole-v1", BULLET])
+def test_specs_are_kept(env_id):
+    env = make(env_id, 2)
+    for stop in (True, False):
+        check_env_specs(env, break_when_any_done=stop)
+    env.close()
+
+
+def test_kinds_of_actions(step_counter):
+    box = GymVectorEnv(step_counter, 2).action_spec
+    assert box.shape == (2, 1) and box.dtype == torch.float32
+    assert box.space.low.min() == -1 and box.space.high.max() == 1
+    discrete = GymVectorEnv(lambda: step_counter(discrete=True), 2).action_spec
+    assert discrete.shape == (2,) and discrete.dtype == torch.int64 and discrete.space.n == 3
+
+    def unbounded():
+        env = step_counter()
+        env.action_space = spaces.Box(-np.inf, np.inf, (2,), np.float32)
+        return env
+
+    assert GymVectorEnv(unbounded, 2).action_spec.shape == (2, 2)
+
+
+def test_transitions_are_aligned_in_a_collected_batch(step_counter):
+    """Each environment ends after four steps; what is seen and paid names step and action."""
+    env = GymVectorEnv(lambda: step_counter(length=4), 2, seed=1)
+    collector = Collector(env, env.rand_action, frames_per_batch=22, total_frames=22)
+    (batch,) = collector
+    step = torch.arange(11) % 4
+    for i in range(2):
+        row = batch[i]
+        action = row["action"][:, 0]
+        assert row["observation"][:, 1].tolist() == step.tolist()
+        assert row["next", "observation"][:, 1].tolist() == (step + 1).tolist()  # 4 is terminal
+        assert torch.equal(row["next", "observation"][:, 2], action)
+        torch.testing.assert_close(row["next", "reward"][:, 0], 100.0 * (step + 1) + action)
+        assert row["next", "done"][:, 0].tolist() == (step == 3).tolist()
+        # An episode's start is its own: constant in it, another one in the next.
+        starts, following = row["observation"][:, 0], row["next", "observation"][:, 0]
+        assert torch.equal(starts, following)
+        assert [len(starts[k : k + 4].unique()) for k in (0, 4, 8)] == [1, 1, 1]
+        assert len(starts.unique()) == 3
+    assert batch["action"].unique().numel() == 22
+    collector.shutdown()
+
+
+def test_limits_truncate_and_failures_terminate(step_counter):
+    def flags(length, limit):
+        env = GymVectorEnv(lambda: step_counter(length=length), 1, max_episode_steps=limit)
+        batch, _ = play(env, random_actions(env, 5))
+        names = ("done", "terminated", "truncated")
+        return [batch["next", name].flatten().nonzero().flatten().tolist() for name in names]
+
+    assert flags(length=3, limit=99) == [[2], [2], []]
+    assert flags(length=99, limit=3) == [[2], [], [2]]
+    assert flags(length=3, limit=3) == [[2], [2], [2]]  # As Gymnasium's TimeLimit.
+    assert flags(length=99, limit=None) == [[], [], []]
+
+
+def test_the_registered_limit_holds_unless_another_is_given():
+    def length(**kwargs):
+        env = GymVectorEnv(lambda: gymnasium.make("Pendulum-v1", **kwargs), 1)
+        done = env.rollout(210, break_when_any_done=True)["next", "truncated"]
+        assert done[0, -1]
+        return done.shape[1]
+
+    assert length() == 200
+    assert length(max_episode_steps=9) == 9
+
+
+def test_only_the_named_environments_are_reset():
+    env = make("CartPole-v1", 3)
+    actions = random_actions(env, 4)
+    batch, root = play(env, actions)
+    assert not batch["next", "done"].any()
+    mask = torch.tensor([[False], [True], [False]])
+    fresh = env.reset(root.clone().set("_reset", mask))
+    assert torch.equal(fresh["observation"][[0, 2]], root["observation"][[0, 2]])
+    assert not torch.equal(fresh["observation"][1], root["observation"][1])
+    # The second episode's beginning, not the first's again.
+    assert not torch.equal(fresh["observation"][1], batch["observation"][1, 0])
+    # The others go on as if nothing had happened, and their clocks with them.
+    onward, _ = play(env, actions, root=fresh)
+    whole, _ = play(make("CartPole-v1", 3), torch.cat([actions, actions]))
+    others = whole[[0, 2], 4:]
+    assert torch.equal(onward["next", "observation"][[0, 2]], others["next", "observation"])
+    assert env.simulator_state()["steps"].tolist() == [8, 4, 8]
+
+
+def test_data_follow_from_the_seed():
+    def observations(**kwargs):
+        env = make("CartPole-v1", 3, **kwargs)
+        return play(env, random_actions(env, 60))[0]["observation"]
+
+    first = observations(seed=1)
+    assert torch.equal(first, observations(seed=1))
+    assert not (first[:, 0] == observations(seed=2)[:, 0]).any()
+    # No two copies and no two episodes begin alike.
+    assert first[:, 0].unique(dim=0).shape[0] == 3
+    env = make("CartPole-v1", 3)
+    starts = torch.cat([env.reset()["observation"] for _ in range(5)])
+    assert starts.unique(dim=0).shape[0] == 15
+    env.set_seed(1)
+    assert torch.equal(env.reset()["observation"], first[:, 0])
+
+
+def test_recorded_data_stay_as_they_were(step_counter):
+    """Neither the simulator's reused array nor the caller's reused memory shows through."""
+    env = GymVectorEnv(lambda: step_counter(length=100), 2)
+    first, _ = env.step_and_maybe_reset(env.rand_action(env.reset()))
+    kept = first.clone()
+    action = torch.zeros(2, 1)
+    root = env.reset()
+    for number in range(3):
+        action.fill_(number)
+        _, root = env.step_and_maybe_reset(root.set("action", action))
+    assert torch.equal(first["next", "observation"], kept["next", "observation"])
+    assert env.simulator_state()["actions"].flatten().tolist() == [0, 0, 1, 1, 2, 2]
+
+
+@pytest.mark.parametrize(
+    ("env_id", "limit"),
+    [("CartPole-v1", None), ("Pendulum-v1", 9), (BULLET, 15), ("StepCounter-v0", None)],
+)
+@pytest.mark.parametrize("before", [0, 1, 37])
+def test_a_restored_simulator_continues_bit_for_bit(env_id, limit, before, tmp_path):
+    env = make(env_id, seed=3, limit=limit)
+    actions = random_actions(env, before + 40)
+    root = env.reset()
+    for action in actions[:before]:
+        _, root = env.step_and_maybe_reset(root.set("action", action))
+    save_state(tmp_path / "state", env.simulator_state())
+    whole, end = play(env, actions[before:], root=root)
+
+    state = load_state(tmp_path / "state")
+    fresh = make(env_id, seed=99, limit=limit)
+    fresh.restore_simulator(state)
+    again = fresh.simulator_state()  # Saved once more before any step: a second interruption.
+    for key in ("seed", "episode", "steps", "observation"):
+        assert np.array_equal(again[key], state[key]), key
+    root = fresh.reset()
+    continued, fresh_end = play(fresh, actions[before:], root=root)
+    for key in KEYS:
+        assert torch.equal(whole[key], continued[key]), key
+    assert torch.equal(end["observation"], fresh_end["observation"])
+    assert whole["next", "done"].any()
+    # Only the first reset stands in the middle of episodes.
+    assert torch.equal(env.reset()["observation"], fresh.reset()["observation"])
+    assert fresh.simulator_state()["steps"].tolist() == [0, 0, 0]
+    env.close()
+    fresh.close()
+
+
+def test_the_history_is_no_longer_than_the_longest_episode():
+    env = make("CartPole-v1", 4)
+    _, root = play(env, random_actions(env, 300))
+    state = env.simulator_state()
+    # Trimmed at resets; since the last one every environment has made as many steps.
+    assert len(state["actions"]) < 120
+    assert len(state["actions"]) >= state["steps"].max()
+
+
+class Restless(gymnasium.Wrapper):
+    """A simulator that does not repeat itself."""
+
+    def step(self, action):
+        observation, *rest = self.env.step(action)
+        return observation + np.random.uniform(size=observation.shape), *rest
+
+
+def test_a_simulator_that_does_not_repeat_itself_is_refused():
+    def make_fn():
+        return Restless(gymnasium.make("CartPole-v1"))
+
+    env = GymVectorEnv(make_fn, 2)
+    play(env, random_actions(env, 3))
+    with pytest.raises(UserError, match="does not repeat itself") as raised:
+        GymVectorEnv(make_fn, 2).restore_simulator(env.simulator_state())
+    assert "out=" in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("name", "space"),
+    [
+        ("observation", spaces.Box(0, 255, (8, 8, 3), np.uint8)),
+        ("observation", spaces.Discrete(4)),
+        ("observation", spaces.Dict({"position": spaces.Box(-1, 1, (2,))})),
+        ("action", spaces.MultiDiscrete([2, 3])),
+        ("action", spaces.Discrete(3, start=1)),
+        ("action", spaces.Box(-1, 1, (2, 2))),
+    ],
+    ids=str,
+)
+def test_other_spaces_are_refused_in_one_sentence(step_counter, name, space):
+    def make_fn():
+        env = step_counter()
+        setattr(env, f"{name}_space", space)
+        return env
+
+    with pytest.raises(UserError) as raised:
+        GymVectorEnv(make_fn, 1)
+    message = str(raised.value)
+    assert message.startswith(f"StepCounter has {name}s of the kind {space}: choose a task with")
+    assert message.endswith(".") and "\n" not in message
+
+
+def test_bullet_prints_nothing(capfd):
+    env = make(BULLET, 2)
+    play(env, random_actions(env, 3))
+    other = make(BULLET, 2)
+    other.restore_simulator(env.simulator_state())
+    ctypes.CDLL(None).fflush(None)  # What C code has printed may still be in its buffer.
+    assert capfd.readouterr().out == ""
+    env.close()
+    other.close()
+
+
+def test_standard_output_works_again_afterwards(capfd):
+    make("CartPole-v1", 1).reset()
+    print("heard")
+    assert capfd.readouterr().out == "heard\n"
+
+
+def test_closing_closes_every_copy(step_counter):
+    closed = []
+
+    class Closing(step_counter):
+        def close(self):
+            closed.append(self)
+
+    env = GymVectorEnv(Closing, 3)
+    env.close()
+    assert len(set(map(id, closed))) == 3
+    env.close(raise_if_closed=False)
+    assert len(closed) == 3
+
+
+def test_rewards_and_observations_are_float32():
+    env = make("Pendulum-v1", 2)
+    step, _ = env.step_and_maybe_reset(
+        TensorDict({"action": torch.zeros(2, 1), "observation": env.reset()["observation"]}, [2])
+    )
+    assert step["next", "reward"].shape == (2, 1)
+    assert {step["next", name].dtype for name in ("observation", "reward")} == {torch.float32}

@@ -1,0 +1,74 @@
+import pytest
+import torch
+from tensordict import TensorDict
+
+from giril_rl.training.checkpoint import load_state, save_state
+from giril_rl.training.episodes import EpisodeTracker
+
+
+def batch(reward, done):
+    shaped = {"reward": reward.unsqueeze(-1), "done": done.unsqueeze(-1)}
+    return TensorDict({"next": shaped}, reward.shape)
+
+
+class Loop:
+    """The same in plain Python."""
+
+    def __init__(self, num_envs):
+        self.total, self.length = [0.0] * num_envs, [0] * num_envs
+
+    def __call__(self, reward, done):
+        returns, lengths = [], []
+        for i in range(len(reward)):
+            for r, d in zip(reward[i].tolist(), done[i].tolist(), strict=True):
+                self.total[i] += r
+                self.length[i] += 1
+                if d:
+                    returns.append(self.total[i])
+                    lengths.append(self.length[i])
+                    self.total[i], self.length[i] = 0.0, 0
+        return returns, lengths
+
+
+@pytest.mark.parametrize("share", [0.0, 0.02, 0.3, 0.97, 1.0])
+@pytest.mark.parametrize(("num_envs", "time"), [(4, 25), (1, 10), (3, 1)])
+def test_equals_a_plain_loop_over_many_batches(num_envs, time, share):
+    generator = torch.Generator().manual_seed(0)
+    tracker, loop = EpisodeTracker(num_envs), Loop(num_envs)
+    for _ in range(8):
+        reward = torch.randn(num_envs, time, generator=generator)
+        done = torch.rand(num_envs, time, generator=generator) < share
+        returns, lengths = tracker(batch(reward, done))
+        expected, expected_lengths = loop(reward, done)
+        assert lengths.tolist() == expected_lengths
+        assert returns.tolist() == pytest.approx(expected, abs=1e-9)
+        assert tracker.running_length.tolist() == loop.length
+        assert tracker.running_return.tolist() == pytest.approx(loop.total, abs=1e-9)
+
+
+def test_returns_are_exact_where_they_are_whole_numbers():
+    tracker = EpisodeTracker(1)
+    done = torch.zeros(1, 1000, dtype=torch.bool)
+    done[0, -1] = True
+    for _ in range(50):
+        assert tracker(batch(torch.ones(1, 1000), done))[0].tolist() == [1000.0]
+
+
+def test_the_batch_is_left_as_it_is():
+    data = batch(torch.randn(2, 5), torch.rand(2, 5) < 0.5)
+    before = data.clone()
+    EpisodeTracker(2)(data)
+    assert (data == before).all()
+
+
+def test_state_goes_through_a_checkpoint(tmp_path):
+    tracker = EpisodeTracker(2)
+    tracker(batch(torch.full((2, 3), 0.1), torch.tensor([[False] * 3, [True, False, False]])))
+    save_state(tmp_path / "state", dict(tracker.state_dict()))
+    other = EpisodeTracker(2)
+    other.load_state_dict(load_state(tmp_path / "state"))
+    last = batch(torch.ones(2, 1), torch.ones(2, 1, dtype=torch.bool))
+    returns, lengths = tracker(last)
+    assert torch.equal(other(last)[0], returns)
+    assert lengths.tolist() == [4, 3]
+    assert returns.tolist() == pytest.approx([1.3, 1.2])
