@@ -1,6 +1,6 @@
 """Many finished runs as one table: every seed, the mean and its 95% interval.
 
-python -m giril_rl.report.summary runs --csv scores.csv
+python -m giril_rl.report.summary runs --csv scores.csv --png curves.png
 """
 
 from __future__ import annotations
@@ -18,8 +18,9 @@ from typing import Any
 import numpy as np
 
 from giril_rl.files import read_json, write_atomically
+from giril_rl.report.curves import draw_curves
 
-COLUMNS = ("task", "run", "steps", "seeds", "mean", "low", "high", "sampled", "each seed")
+COLUMNS = ("task", "run", "steps", "seeds", "mean", "low", "high", "deterministic", "each seed")
 
 
 @dataclass(frozen=True)
@@ -31,7 +32,8 @@ class Row:
     steps: int
     seeds: tuple[int, ...]
     returns: tuple[float, ...]
-    sampled: tuple[float, ...]
+    deterministic: tuple[float, ...]
+    folders: tuple[Path, ...] = ()
 
     @property
     def cells(self) -> list[str]:
@@ -45,7 +47,7 @@ class Row:
             f"{np.mean(self.returns):,.1f}",
             f"{low:,.1f}",
             f"{high:,.1f}",
-            f"{np.mean(self.sampled):,.1f}",
+            f"{np.mean(self.deterministic):,.1f}",
             " ".join(f"{value:,.1f}" for value in self.returns),
         ]
 
@@ -66,13 +68,14 @@ def interval(values: Sequence[float], *, resamples: int = 10_000) -> tuple[float
 
 def collect(folders: Iterable[Path]) -> list[Row]:
     """Rows of all finished runs below ``folders``, grouped by the folder above ``seedN``."""
-    groups: dict[Path, list[dict[str, Any]]] = defaultdict(list)
+    groups: dict[Path, dict[Path, dict[str, Any]]] = defaultdict(dict)
     for folder in folders:
         for path in sorted(folder.rglob("result.json")):
-            groups[path.parent.parent].append(read_json(path))
+            groups[path.parent.parent][path.parent] = read_json(path)
     rows = []
-    for place, results in groups.items():
-        results.sort(key=lambda result: result["seed"])
+    for place, runs in groups.items():
+        runs = dict(sorted(runs.items(), key=lambda run: run[1]["seed"]))
+        results = list(runs.values())
         rows.append(
             Row(
                 task=results[0]["task"],
@@ -80,7 +83,8 @@ def collect(folders: Iterable[Path]) -> list[Row]:
                 steps=results[0]["env_steps"],
                 seeds=tuple(result["seed"] for result in results),
                 returns=tuple(result["return_mean"] for result in results),
-                sampled=tuple(result["sampled"]["return_mean"] for result in results),
+                deterministic=tuple(result["deterministic"]["return_mean"] for result in results),
+                folders=tuple(runs),
             )
         )
     return sorted(rows, key=lambda row: (row.task, row.steps, row.run))
@@ -102,7 +106,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     """Print the table of all finished runs below some folders, and write it as CSV."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("folders", nargs="+", type=Path)
-    parser.add_argument("--csv", type=Path, help="file to write besides")
+    parser.add_argument("--csv", type=Path, help="file to write the table to besides")
+    parser.add_argument("--png", type=Path, help="file to draw the learning curves in")
     args = parser.parse_args(argv)
     rows = collect(args.folders)
     sys.stdout.write(markdown(rows))
@@ -110,6 +115,14 @@ def main(argv: Sequence[str] | None = None) -> None:
         text = io.StringIO()
         csv.writer(text, lineterminator="\n").writerows([COLUMNS, *(row.cells for row in rows)])
         write_atomically(args.csv, text.getvalue())
+    if args.png is not None:
+        panels: dict[str, dict[str, tuple[Path, ...]]] = defaultdict(dict)
+        steps = {}
+        for row in rows:
+            title = f"{row.task}, {row.steps:,} steps"
+            panels[title][row.run] = row.folders
+            steps[title] = row.steps
+        draw_curves(panels, steps, args.png)
 
 
 if __name__ == "__main__":

@@ -70,8 +70,8 @@ def evaluate_run(folder: Path, episodes: int | None = None, seed: int | None = N
     scores = evaluate_both(agent, task, episodes=episodes, seed=seed)
     write_json(folder / "eval.json", {"task": task.name, "eval_seed": seed, **scores})
     print(f"{task.name}, {episodes} episodes each, evaluation seed {seed}")
-    print(describe("deterministic", scores))
-    print(describe("sampled", scores["sampled"]))  # type: ignore[arg-type]
+    print(describe("sampled", scores))
+    print(describe("deterministic", scores["deterministic"]))  # type: ignore[arg-type]
 
 
 def print_scores(folder: Path) -> None:
@@ -82,8 +82,8 @@ def print_scores(folder: Path) -> None:
         score = result.get(f"{who}_return_mean")
         if score is not None:
             print(f"{who:<14} return {score:,.1f}")
-    print(describe("deterministic", result))
-    print(describe("sampled", result["sampled"]))
+    print(describe("sampled", result))
+    print(describe("deterministic", result["deterministic"]))
 
 
 def describe(kind: str, scores: dict[str, Any]) -> str:

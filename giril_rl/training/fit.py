@@ -62,7 +62,7 @@ def fit_reward(
         optimizer.load_state_dict(saved["optimizer"])
         generator.set_state(saved["minibatches"])
         torch.set_rng_state(saved["rng"])
-        run.truncate_metrics(phase, step)
+    run.truncate_metrics(phase, step)
     began = time.perf_counter() - seconds
     with Interrupt() as interrupt, progress(cfg.steps, step, "reward model") as bar:
         while step < cfg.steps:

@@ -107,7 +107,7 @@ def train_ppo(
         parts.load_state_dict(saved["parts"])
         learner.optimizer.load_state_dict(saved["optimizer"])
         torch.set_rng_state(saved["rng"])
-        run.truncate_metrics(phase, taken)
+    run.truncate_metrics(phase, taken)
     next_save = (taken // cfg.checkpoint_every + 1) * cfg.checkpoint_every
     stopped = False
     true_return = "?"

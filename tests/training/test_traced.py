@@ -5,6 +5,7 @@ import torch
 from tensordict import TensorDict
 from torch import nn
 from torchrl.data import Bounded, Categorical
+from torchrl.objectives import ClipPPOLoss
 
 from giril_rl.networks.policy import NORMALISED, ActorCritic
 from giril_rl.rewards import GenerativeReward, GenerativeRewardLoss
@@ -39,6 +40,11 @@ class PPO:
             functional=False,
         )
 
+    def twin(self):
+        twin = copy.deepcopy(self.loss)
+        twin.__class__ = ClipPPOLoss  # TorchRL's own
+        return twin
+
     def batch(self, size):
         data = self.agent.acting()(TensorDict({"observation": torch.randn(size, 4)}, [size]))
         # Another policy's probabilities, so that the clipping matters.
@@ -61,6 +67,9 @@ class Generative:
         reward.scaler.fit(torch.randn(50, 4))
         self.loss = GenerativeRewardLoss(reward)
         self.keys = self.loss.in_keys
+
+    def twin(self):
+        return copy.deepcopy(self.loss)
 
     def batch(self, size):
         action = torch.randint(3, (size,)) if self.kind == "discrete" else torch.randn(size, 2)
@@ -104,7 +113,7 @@ def assert_same(found, expected, parameters, eager_parameters):
 def test_bits_are_those_of_an_ordinary_backward_pass_throughout_training(case, kind):
     """Ten steps: the interpreter optimises a recorded graph anew in its first few runs."""
     made = case(kind)
-    twin = copy.deepcopy(made.loss)
+    twin = made.twin()
     traced = TracedGradients(made.loss, keys=made.keys, log=made.log)
     assert len(traced.parameters) == len(list(twin.parameters())) > 8
     pairs = [(made.loss, traced.parameters), (twin, list(twin.parameters()))]
@@ -130,7 +139,7 @@ def test_bits_are_those_of_an_ordinary_backward_pass_throughout_training(case, k
 
 def test_another_shape_is_recorded_anew(case):
     made = case("box")
-    twin = copy.deepcopy(made.loss)
+    twin = made.twin()
     traced = TracedGradients(made.loss, keys=made.keys, log=made.log)
     for size in (32, 8, 32, 1 if case is Generative else 2, 8):
         batch = made.batch(size)
@@ -143,7 +152,7 @@ def test_another_shape_is_recorded_anew(case):
 @pytest.mark.parametrize("share", [0.01, 0.9, 1.1, 100.0])
 def test_clipping_is_torchs(case, share):
     made = case("box")
-    twin = copy.deepcopy(made.loss)
+    twin = made.twin()
     batch = made.batch(32)
     torch.manual_seed(3)
     eager(twin, batch, ())

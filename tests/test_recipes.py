@@ -1,0 +1,240 @@
+"""Every recipe from its command to its result, with settings so small that nothing is learned."""
+
+import json
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+
+from giril_rl.cli import main
+from giril_rl.envs import GymVectorEnv
+from giril_rl.training.checkpoint import load_state
+from giril_rl.training.metrics import read_metrics
+
+BATCH = 128
+TINY = [
+    "ppo.num_envs=2",
+    "ppo.rollout=64",
+    "ppo.minibatch=64",
+    "ppo.epochs=1",
+    "ppo.hidden=[16,16]",
+    "ppo.checkpoint_every=256",
+    "eval.episodes=2",
+    "logger=null",
+]
+GIRIL = [
+    "expert.steps=10000",
+    "demo.length=100",
+    "demo.subsample=2",
+    "fit.steps=20",
+    "fit.log_every=10",
+    "reward.hidden=[16]",
+    "reward.beta=0.7",  # Then the reward is noisy: more to save and restore.
+]
+EXTRA = {"giril": GIRIL, "expert": ["stop_early=false"], "control": []}
+
+SCORES = ["return_mean", "return_std", "return_median", "episode_length_mean", "episodes"]
+FIELDS = [
+    *("method", "task", "seed", "env_steps", *SCORES, "wall_seconds", "steps_per_second"),
+    *("expert_return_mean", "demo_return_mean", "demo_transitions", "config_hash", "versions"),
+    "finished_at",
+]
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory):
+    """Where this file's runs share one expert and one demonstration."""
+    return tmp_path_factory.mktemp("runs")
+
+
+def words(recipe, out, root, *more, steps=4 * BATCH):
+    place = [f"out={out}", f"root={root}", f"steps={steps}", "task.env_id=CartPole-v1"]
+    # A key may be given once, so later words take the place of earlier ones.
+    by_key = {word.split("=")[0]: word for word in [*TINY, *EXTRA[recipe], *place, *more]}
+    if "task" in by_key:
+        del by_key["task.env_id"]
+    return ["run", recipe, *by_key.values()]
+
+
+def run(recipe, out, root, *more, **kwargs):
+    assert main(words(recipe, out, root, *more, **kwargs)) == 0
+    return json.loads((Path(out) / "result.json").read_text())
+
+
+def timeless(folder):
+    """Metrics less what a clock says."""
+    rows = read_metrics(Path(folder) / "metrics.jsonl")
+    return [{k: v for k, v in row.items() if "seconds" not in k} for row in rows]
+
+
+def weights(folder):
+    """Every tensor of the policy, bit for bit; the file's own header has no fixed order."""
+    state = load_state(Path(folder) / "policy.safetensors")
+    return {name: (str(value.dtype), value.tolist()) for name, value in state.items()}
+
+
+def stamps(folder):
+    files = [path for path in Path(folder).rglob("*") if path.is_file()]
+    # A run's lock and versions are written whenever it is opened.
+    kept = [path for path in files if path.name != "versions.json" and path.suffix != ".lock"]
+    return {path: path.stat().st_mtime_ns for path in kept if path.name != ".lock"}
+
+
+def assert_whole(folder, result, recipe, task, steps):
+    assert set(FIELDS) <= set(result)
+    assert result["task"] == task and result["env_steps"] == steps
+    assert result["method"] == {"control": "control:constant"}.get(recipe, recipe)
+    for scores in (result, result["deterministic"]):
+        assert all(math.isfinite(scores[name]) for name in SCORES)
+        assert len(scores["returns"]) == scores["episodes"] == 2
+        assert scores["return_mean"] == pytest.approx(sum(scores["returns"]) / 2)
+        assert scores["episode_length_mean"] >= 1
+    assert result["wall_seconds"] > 0
+    speed = steps / result["wall_seconds"]
+    assert result["steps_per_second"] == pytest.approx(speed)
+    assert result["versions"]["torch"] == str(torch.__version__)
+    found = [row for row in timeless(folder) if row["phase"] == "ppo"]
+    assert [row["step"] for row in found] == list(range(BATCH, steps + 1, BATCH))
+    assert {"config.yaml", "versions.json", "policy.safetensors", "curve.csv", "curve.png"} <= {
+        path.name for path in Path(folder).iterdir()
+    }
+
+
+@pytest.mark.parametrize("recipe", EXTRA)
+def test_a_recipe_leaves_a_whole_result(recipe, root, tmp_path, capsys):
+    result = run(recipe, tmp_path / "run", root)
+    assert_whole(tmp_path / "run", result, recipe, "CartPole-v1", 4 * BATCH)
+    printed = capsys.readouterr().out
+    assert f"{result['return_mean']:,.1f}" in printed
+    if recipe == "giril":
+        assert result["demo_transitions"] == 100
+        assert math.isfinite(result["expert_return_mean"]) and result["demo_return_mean"] > 5
+        fit = [row for row in timeless(tmp_path / "run") if row["phase"] == "fit"]
+        assert [row["step"] for row in fit] == [10, 20]
+        expert = json.loads(next(root.glob("expert/*/*/result.json")).read_text())
+        assert result["expert_return_mean"] == expert["return_mean"]
+    else:
+        keys = ("expert_return_mean", "demo_return_mean", "demo_transitions")
+        assert [result[key] for key in keys] == [None] * 3
+    # What was saved is what was scored.
+    assert main(["eval", str(tmp_path / "run")]) == 0
+    again = json.loads((tmp_path / "run" / "eval.json").read_text())
+    assert again["returns"] == result["returns"]
+    assert again["deterministic"] == result["deterministic"]
+
+
+def test_continuous_actions_with_pybullet(root, tmp_path, capfd):
+    """The shipped task; the expert's folder and demonstration are given by their paths."""
+    task = "task=inverted_pendulum"
+    run("expert", tmp_path / "expert", root, task)
+    more = [task, f"expert.path={tmp_path / 'expert'}", "demo.length=40"]
+    result = run("giril", tmp_path / "giril", root, *more)
+    assert_whole(tmp_path / "giril", result, "giril", "inverted_pendulum", 4 * BATCH)
+    demo = next(root.glob("demos/inverted_pendulum/*/card.json")).parent
+    given = run("giril", tmp_path / "given", root, task, f"demo.path={demo}")
+    assert weights(tmp_path / "given") == weights(tmp_path / "giril")
+    assert given["expert_return_mean"] is None
+    assert given["demo_return_mean"] == result["demo_return_mean"]
+    assert "argv" not in capfd.readouterr().out
+
+
+def test_expert_and_demonstration_are_made_once(root, tmp_path):
+    run("giril", tmp_path / "a", root)
+    before = stamps(root)
+    assert len(list(root.glob("expert/CartPole-v1/*/result.json"))) == 1
+    assert len(list(root.glob("demos/CartPole-v1/*/card.json"))) == 1
+    run("giril", tmp_path / "b", root, "seed=1", "ppo.lr=0.001", "demo.subsample=5")
+    assert stamps(root) == before
+    # A demonstration with other settings is another one, of the same expert.
+    run("giril", tmp_path / "c", root, "demo.length=60")
+    assert len(list(root.glob("demos/CartPole-v1/*/card.json"))) == 2
+    assert {path: stamps(root)[path] for path in before} == before
+
+
+def test_a_finished_command_does_not_train_again(root, tmp_path, monkeypatch, capsys):
+    run("giril", tmp_path, root)
+    before, shown = stamps(tmp_path), capsys.readouterr().out
+    monkeypatch.setattr(GymVectorEnv, "_step", None)
+    run("giril", tmp_path, root)
+    assert stamps(tmp_path) == before
+    assert capsys.readouterr().out == shown
+
+
+@pytest.mark.parametrize("recipe", EXTRA)
+def test_a_run_follows_from_its_seed(recipe, root, tmp_path):
+    results = {}
+    for number, (name, seed) in enumerate((("one", 0), ("two", 0), ("three", 1))):
+        torch.manual_seed(number)  # What this process did before decides nothing.
+        results[name] = run(recipe, tmp_path / name, root, f"seed={seed}")
+    assert timeless(tmp_path / "one") == timeless(tmp_path / "two")
+    assert weights(tmp_path / "one") == weights(tmp_path / "two")
+    clock = {"wall_seconds", "steps_per_second", "finished_at"}
+    one, two = ({k: v for k, v in results[n].items() if k not in clock} for n in ("one", "two"))
+    assert one == two
+    assert weights(tmp_path / "one") != weights(tmp_path / "three")
+    assert timeless(tmp_path / "one")[0] != timeless(tmp_path / "three")[0]
+
+
+# Stopping a process
+
+LONG = 60 * BATCH
+
+
+def start_and_stop(command, folder, number):
+    """Starts ``giril`` and signals it once five batches are on record; its code and its words."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", "giril_rl.cli", *command],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+        # Processes of some shells ignore it.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )
+    deadline = time.monotonic() + 120
+    try:
+        while sum(row["phase"] == "ppo" for row in timeless(folder)) < 5:
+            assert process.poll() is None, process.stderr.read()
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+        process.send_signal(number)
+        _, error = process.communicate(timeout=60)
+    finally:
+        process.kill()
+        process.wait()
+    assert not (folder / "result.json").exists()
+    return process.returncode, error
+
+
+def test_a_killed_run_ends_as_an_undisturbed_one(root, tmp_path):
+    expected = run("giril", tmp_path / "whole", root, steps=LONG)
+    command = words("giril", tmp_path / "run", root, steps=LONG)
+    assert start_and_stop(command, tmp_path / "run", signal.SIGKILL)[0] == -signal.SIGKILL
+    saved = load_state(tmp_path / "run" / "ppo.safetensors")["steps"]
+    assert 0 < saved < LONG
+    result = run("giril", tmp_path / "run", root, steps=LONG)
+    assert weights(tmp_path / "run") == weights(tmp_path / "whole")
+    assert timeless(tmp_path / "run") == timeless(tmp_path / "whole")
+    assert result["returns"] == expected["returns"]
+
+
+def test_an_interrupted_run_says_so_and_ends_as_an_undisturbed_one(root, tmp_path):
+    run("control", tmp_path / "whole", root, steps=LONG)
+    command = words("control", tmp_path / "run", root, steps=LONG)
+    code, error = start_and_stop(command, tmp_path / "run", signal.SIGINT)
+    assert code == 130
+    saved = load_state(tmp_path / "run" / "ppo.safetensors")["steps"]
+    # Nothing was lost, not even what came after the last regular checkpoint.
+    assert saved == timeless(tmp_path / "run")[-1]["step"]
+    sentence = f"interrupted at {saved:,} of {LONG:,} steps: the same command continues from there"
+    assert error.splitlines()[-1] == f"giril: {sentence}."
+    assert "Traceback" not in error
+    run("control", tmp_path / "run", root, steps=LONG)
+    assert weights(tmp_path / "run") == weights(tmp_path / "whole")
+    assert timeless(tmp_path / "run") == timeless(tmp_path / "whole")

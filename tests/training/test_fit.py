@@ -1,0 +1,152 @@
+import signal
+
+import pytest
+import torch
+from tensordict import TensorDict
+from torchrl.data import Bounded, Categorical
+
+from giril_rl.configs import FitConfig
+from giril_rl.rewards import GenerativeReward, GenerativeRewardLoss
+from giril_rl.training import fit
+from giril_rl.training.interrupt import Interrupted
+from giril_rl.training.metrics import read_metrics
+from giril_rl.training.run import Run
+
+SPECS = {"box": Bounded(-1, 1, shape=(1, 1)), "discrete": Categorical(3, shape=(1,))}
+TERMS = ("reconstruction", "kl", "action")
+
+
+def transitions(n, seed=0, kind="box"):
+    """The next state tells the action: ``s' = s + a`` in the first dimension."""
+    generator = torch.Generator().manual_seed(seed)
+    observation = torch.rand(n, 3, generator=generator) - 0.5
+    if kind == "discrete":
+        action = torch.randint(3, (n,), generator=generator)
+        push = action.unsqueeze(-1).float() - 1
+    else:
+        action = push = 2 * torch.rand(n, 1, generator=generator) - 1
+    following = observation + 0.5 * torch.cat([push, torch.zeros(n, 2)], 1)
+    entries = {"observation": observation, "action": action}
+    return TensorDict({**entries, "next": {"observation": following}}, [n])
+
+
+def fitted(folder, *, kind="box", data=None, held_out=None, seed=0, model_seed=0, **kwargs):
+    """Fits a new model; its weights and the rows of the log."""
+    cfg = FitConfig(**{"steps": 60, "batch": 16, "lr": 3e-3, "log_every": 10, **kwargs})
+    reward = GenerativeReward.for_vectors(
+        3, SPECS[kind], hidden=[16], normalise="raw", clamp=False, seed=model_seed
+    )
+    data = transitions(100, kind=kind) if data is None else data
+    loss = GenerativeRewardLoss(reward)
+    with Run.open(folder, {}, recipe="x") as run:
+        fit.fit_reward(loss, data, cfg, seed=seed, run=run, held_out=held_out)
+    return dict(loss.named_parameters()), read_metrics(folder / "metrics.jsonl")
+
+
+def same(one, other):
+    return all(torch.equal(one[name], other[name]) for name in one)
+
+
+@pytest.mark.parametrize("kind", SPECS)
+def test_the_losses_fall_on_fitted_and_held_out_data(kind, tmp_path):
+    held_out = transitions(50, seed=9, kind=kind)
+    _, rows = fitted(tmp_path, kind=kind, held_out=held_out, steps=300)
+    assert {row["phase"] for row in rows} == {"fit"}
+    assert [row["step"] for row in rows] == list(range(10, 301, 10))
+    for name in ("fitted", "held_out"):
+        total = [sum(row[f"fit/{name}/{term}"] for term in TERMS) for row in rows]
+        assert total[-1] < 0.8 * total[0]
+
+
+def test_held_out_data_are_logged_and_never_fitted(tmp_path):
+    held_out = transitions(50, seed=9)
+    weights, rows = fitted(tmp_path / "a", held_out=held_out)
+    other_weights, other_rows = fitted(tmp_path / "b", held_out=held_out.apply(lambda x: x * 3))
+    none_weights, none_rows = fitted(tmp_path / "c")
+    empty_weights, _ = fitted(tmp_path / "d", held_out=held_out[:0])
+    assert same(weights, other_weights)
+    assert same(weights, none_weights)
+    assert same(weights, empty_weights)
+    for row, other, none in zip(rows, other_rows, none_rows, strict=True):
+        for term in TERMS:
+            key = f"fit/fitted/{term}"
+            assert row[key] == other[key] == none[key]
+        key = "fit/held_out/reconstruction"
+        assert row[key] != other[key]
+        assert key not in none
+
+
+def test_logged_losses_are_those_of_the_whole_set(tmp_path):
+    data = transitions(40)
+    weights, rows = fitted(tmp_path, data=data, steps=10)
+    reward = GenerativeReward.for_vectors(3, SPECS["box"], hidden=[16], normalise="raw")
+    reward.scaler.clamp = False
+    loss = GenerativeRewardLoss(reward)
+    loss.load_state_dict(weights, strict=False)
+    with torch.random.fork_rng(devices=[]), torch.no_grad():
+        torch.manual_seed(0)
+        expected = loss(data)
+    for term in TERMS:
+        assert rows[-1][f"fit/fitted/{term}"] == pytest.approx(expected[f"loss_{term}"].item())
+
+
+def test_seeds_and_data_decide_everything(tmp_path):
+    torch.manual_seed(77)
+    first, _ = fitted(tmp_path / "first")
+    torch.manual_seed(78)
+    again, _ = fitted(tmp_path / "again")
+    assert same(first, again)
+    # Noise and minibatches, at the same initial weights.
+    assert not same(first, fitted(tmp_path / "seed", seed=1)[0])
+    assert not same(first, fitted(tmp_path / "model", model_seed=1)[0])
+    assert not same(first, fitted(tmp_path / "data", data=transitions(100, seed=1))[0])
+    # How often is logged decides nothing.
+    assert same(first, fitted(tmp_path / "log", log_every=7)[0])
+
+
+class Killed(Exception):
+    """Stands for kill -9: nothing is saved after it."""
+
+
+@pytest.mark.parametrize("log_every", [10, 7])
+def test_a_fit_stopped_again_and_again_ends_bit_for_bit_as_an_undisturbed_one(
+    log_every, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(fit, "CHECKPOINT_EVERY", 20)
+    held_out = transitions(20, seed=5)
+    weights, rows = fitted(tmp_path / "whole", held_out=held_out, log_every=log_every)
+    log = Run.log
+    stops = [(1, Killed), (1, Interrupted), (4, Killed), (5, Interrupted), (6, Killed)]
+    for number, how in stops:
+        with monkeypatch.context() as patch, pytest.raises(how):
+
+            def log_and_stop(self, step, values, *, phase, number=number, how=how):
+                log(self, step, values, phase=phase)
+                if step >= number * log_every:
+                    if how is Killed:
+                        raise Killed
+                    signal.raise_signal(signal.SIGINT)
+
+            patch.setattr(Run, "log", log_and_stop)
+            fitted(tmp_path / "run", held_out=held_out, log_every=log_every)
+        torch.manual_seed(99)
+    found, found_rows = fitted(tmp_path / "run", held_out=held_out, log_every=log_every)
+    assert same(found, weights)
+    assert found_rows == rows
+    assert rows[-1]["step"] == 60
+
+
+def test_a_finished_fit_is_only_loaded(tmp_path):
+    weights, rows = fitted(tmp_path)
+    before = (tmp_path / "fit.safetensors").stat().st_mtime_ns
+    again, same_rows = fitted(tmp_path, model_seed=5)
+    assert same(weights, again)
+    assert rows == same_rows
+    assert (tmp_path / "fit.safetensors").stat().st_mtime_ns == before
+
+
+def test_no_steps_leave_the_model_as_it_is(tmp_path):
+    weights, rows = fitted(tmp_path, steps=0)
+    fresh = GenerativeReward.for_vectors(3, SPECS["box"], hidden=[16], seed=0)
+    assert same(weights, dict(GenerativeRewardLoss(fresh).named_parameters()))
+    assert rows == []
