@@ -74,7 +74,7 @@ class PPOConfig:
     """Proximal policy optimisation, as the paper's continuous control experiments set it."""
 
     num_envs: int = knob(16, "parallel environments", low=1)
-    rollout: int = knob(625, "steps per environment between updates", low=1)
+    rollout: int = knob(125, "steps per environment between updates", low=1)
     epochs: int = knob(10, "passes over each batch", low=1)
     minibatch: int = knob(250, "transitions per gradient step; divides num_envs * rollout", low=1)
     lr: float = knob(3e-4, "Adam step size", low=0, low_open=True)

@@ -29,7 +29,7 @@ TINY = [
     "logger=null",
 ]
 GIRIL = [
-    "expert.steps=10000",
+    "expert.steps=2000",
     "demo.length=100",
     "demo.subsample=2",
     "fit.steps=20",

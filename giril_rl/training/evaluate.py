@@ -95,9 +95,7 @@ def evaluate_both(
 
     The first are what tables quote: PPO maximises the return of the sampling policy, and the
     paper's curves are of its training episodes. Where actions keep a deviation near 1, the mode is
-    a policy that was never tried.
-
-    The entries are those of :class:`Scores`; the first ones are what tables quote.
+    a policy that was never tried. The entries are those of :class:`Scores`.
     """
     scores = {
         deterministic: evaluate(

@@ -60,7 +60,6 @@ def train_expert(cfg: ExpertRunConfig, folder: Path) -> dict[str, Any]:
             run=run,
             stop_at=cfg.task.expert_score if cfg.stop_early else None,
         )
-        env.close()
         return finish_run(run, cfg, agent, trained, method="expert")
 
 
@@ -68,7 +67,7 @@ def obtain_expert(cfg: RunConfig, expert: ExpertConfig) -> tuple[Path, dict[str,
     """The folder and result of the expert that a recipe asks for, trained first if need be.
 
     Args:
-        cfg: the recipe's settings, of which task, root and evaluation are shared.
+        cfg: the recipe's settings, of which task and root are shared.
         expert: the expert's own.
 
     Raises:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections import deque
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -59,7 +60,7 @@ def train_ppo(
     on, the simulators' state included, so that an interrupted run ends with the same weights.
 
     Args:
-        env: the training environments.
+        env: the training environments; closed at the end.
         agent: policy and value network.
         relabel: a transform or a composition of them, called with each batch ``(num_envs, time)``;
             its ``state_dict`` is checkpointed.
@@ -113,7 +114,12 @@ def train_ppo(
     true_return = "?"
     began = time.perf_counter() - (0.0 if saved is None else saved["seconds"])
 
-    with Interrupt() as interrupt, progress(steps, taken, phase) as bar:
+    with (
+        contextlib.ExitStack() as stack,
+        Interrupt() as interrupt,
+        progress(steps, taken, phase) as bar,
+    ):
+        stack.callback(collector.shutdown)
         for batch in collector:
             started = time.perf_counter()
             returns, lengths = tracker(batch)
@@ -148,9 +154,7 @@ def train_ppo(
             if stopped:
                 break
             if interrupt.requested and taken < steps:
-                collector.shutdown(close_env=False)
                 raise Interrupted.at(taken, steps)
-    collector.shutdown(close_env=False)
     return Trained(taken, time.perf_counter() - began)
 
 

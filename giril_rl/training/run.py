@@ -212,6 +212,8 @@ class Run:
 
     def _write_versions(self) -> None:
         path = self.folder / "versions.json"
+        if self.finished and path.exists():
+            return  # What is only looked at was not made with these versions.
         before = read_json(path) if path.exists() else self.versions
         for name, now in self.versions.items():
             if before.get(name) != now:

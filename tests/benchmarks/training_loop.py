@@ -47,6 +47,7 @@ def ours(task: TaskConfig, cfg: PPOConfig) -> Callable[[int], None]:
     relabel = Compose(IntrinsicReward(reward), BatchMeanReward(), ReturnScaling(cfg.gamma))
 
     def train(steps: int) -> None:
+        env = make_env(task, cfg.num_envs, seed=0)
         with (
             tempfile.TemporaryDirectory() as folder,
             Run.open(Path(folder) / "run", {}, recipe="benchmark") as run,
@@ -84,8 +85,8 @@ def main() -> None:
     """Print steps per second of both and the ratio, pair by pair."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--task", choices=ENV_IDS, default="inverted_pendulum")
-    parser.add_argument("--rounds", type=int, default=7)
-    parser.add_argument("--batches", type=int, default=3, help="batches a round")
+    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--batches", type=int, default=50, help="batches a round")
     args = parser.parse_args()
     warnings.simplefilter("ignore")
     torch.set_num_threads(1)
