@@ -17,8 +17,8 @@ class TracedGradients:
     For networks of a few hundred units most of a gradient step is Python: TensorDict look-ups,
     argument checks, statistics that nobody reads. Here the module's forward and backward pass are
     recorded for one shape as a graph of plain tensor operations, in which whatever does not lead to
-    a loss is dropped. The numbers are the module's own, bit for bit; a step takes less than
-    half the time, and nothing is compiled (``torch.compile`` was both slower to start and slower to run
+    a loss is dropped. The numbers are the module's own, bit for bit; a step takes less than half
+    the time, and nothing is compiled (``torch.compile`` was both slower to start and slower to run
     for these sizes on a CPU: see ``tests/benchmarks``).
 
     Tensors that are not parameters (coefficients, scales) are recorded as they are at the first
