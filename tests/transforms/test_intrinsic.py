@@ -99,6 +99,7 @@ def test_collector_postproc_over_several_batches(counter_env, policy, telling):
         frames_per_batch=12,
         total_frames=48,
         postproc=IntrinsicReward(telling()),
+        auto_register_policy_transforms=False,
     )
     for data in collector:
         assert data.shape == (3, 4)
