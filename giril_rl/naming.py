@@ -13,7 +13,8 @@ from typing import Any
 from giril_rl.configs import ExpertRunConfig
 
 _OWN_PLACE = {"task", "task.name", "seed"}
-_NO_EFFECT = {"out", "root", "logger", "threads"}
+NO_EFFECT = frozenset({"out", "root", "logger", "threads"})
+"""Keys that change where and how fast a run is made, not its numbers."""
 _LONGEST = 80
 
 
@@ -31,7 +32,7 @@ def config_hash(config: Any) -> str:
         >>> config_hash(RunConfig(seed=1)) == config_hash(RunConfig(seed=1, root="elsewhere"))
         True
     """
-    values = {key: value for key, value in asdict(config).items() if key not in _NO_EFFECT}
+    values = {key: value for key, value in asdict(config).items() if key not in NO_EFFECT}
     return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:12]
 
 
@@ -74,7 +75,7 @@ def variant(changes: Mapping[str, str], without: frozenset[str] = frozenset()) -
         >>> variant({"seed": "seed=3"})
         'default'
     """
-    left_out = _OWN_PLACE | _NO_EFFECT | without
+    left_out = _OWN_PLACE | NO_EFFECT | without
     kept = sorted(text for key, text in changes.items() if key not in left_out)
     return safe(",".join(kept), distinct=True) if kept else "default"
 

@@ -70,8 +70,7 @@ def evaluate_run(folder: Path, episodes: int | None = None, seed: int | None = N
     scores = evaluate_both(agent, task, episodes=episodes, seed=seed)
     write_json(folder / "eval.json", {"task": task.name, "eval_seed": seed, **scores})
     print(f"{task.name}, {episodes} episodes each, evaluation seed {seed}")
-    print(describe("sampled", scores))
-    print(describe("deterministic", scores["deterministic"]))  # type: ignore[arg-type]
+    _print_both(scores)
 
 
 def print_scores(folder: Path) -> None:
@@ -82,8 +81,12 @@ def print_scores(folder: Path) -> None:
         score = result.get(f"{who}_return_mean")
         if score is not None:
             print(f"{who:<14} return {score:,.1f}")
-    print(describe("sampled", result))
-    print(describe("deterministic", result["deterministic"]))
+    _print_both(result)
+
+
+def _print_both(scores: dict[str, Any]) -> None:
+    print(describe("sampled", scores))
+    print(describe("deterministic", scores["deterministic"]))
 
 
 def describe(kind: str, scores: dict[str, Any]) -> str:

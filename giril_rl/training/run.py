@@ -14,11 +14,9 @@ from filelock import FileLock, Timeout
 
 from giril_rl.errors import UserError
 from giril_rl.files import installed_versions, read_json, write_atomically, write_json
+from giril_rl.naming import NO_EFFECT
 from giril_rl.training.checkpoint import load_state, save_state
 from giril_rl.training.metrics import MetricsFile, check_logger, make_logger
-
-IGNORED = frozenset({"out", "root", "logger", "threads"})
-"""Keys that may differ when a run is continued: they change where and how fast, not the numbers."""
 
 
 class Run:
@@ -70,7 +68,7 @@ class Run:
         *,
         recipe: str,
         logger: str | None = None,
-        ignore: Collection[str] = IGNORED,
+        ignore: Collection[str] = NO_EFFECT,
     ) -> Run:
         """Make a run's folder, or open it again to continue; use the result in a ``with``.
 

@@ -8,7 +8,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
-from giril_rl.networks.recorded import record
+from giril_rl.training.recorded import record
 
 
 class TracedGradients:
