@@ -67,6 +67,19 @@ class TaskConfig:
     )
     steps: int = knob(1_000_000, "default policy steps for this task", low=1)
     expert_score: float | None = knob(None, "mean training return at which the expert stops early")
+    expert_steps: int = knob(
+        5_000_000, "most environment steps of the task's expert (paper: 5M)", low=1
+    )
+    horizon: str = knob(
+        "own",
+        "own: a failure ends an episode; fixed: only the time limit does (policy training only)",
+        choices=("own", "fixed"),
+    )
+    after_failure: str = knob(
+        "reset",
+        "horizon=fixed: reset the simulator unnoticed, or continue from where it failed",
+        choices=("reset", "continue"),
+    )
 
 
 @dataclass
@@ -96,10 +109,16 @@ class PPOConfig:
 class ExpertConfig:
     """The player whose demonstration is imitated: PPO on the true reward."""
 
-    steps: int = knob(5_000_000, "most environment steps of expert training (paper: 5M)", low=1)
+    steps: int | None = knob(
+        None, "most environment steps of expert training; null takes task.expert_steps", low=1
+    )
     seed: int = knob(0, "seed of the expert, separate from the policy's", low=0)
     stop_early: bool = knob(True, "stop once the mean return reaches task.expert_score")
     path: str | None = knob(None, "folder of a finished expert run to use instead of training one")
+
+    def steps_on(self, task: TaskConfig) -> int:
+        """Most environment steps of this expert's training on ``task``."""
+        return task.expert_steps if self.steps is None else self.steps
 
 
 @dataclass
@@ -147,6 +166,65 @@ class GenerativeConfig:
 
 
 @dataclass
+class AdversarialConfig:
+    """GAIL's discriminator, its training and the reward made of it."""
+
+    form: str = knob(
+        "positive",
+        "reward of D = P(expert): positive -log(1-D), negative log D, log_ratio, reversed -log D",
+        choices=("positive", "negative", "log_ratio", "reversed"),
+    )
+    lr: float = knob(1e-3, "Adam step size (paper: 1e-3)", low=0, low_open=True)
+    updates: int = knob(10, "gradient steps with each batch of PPO", low=1)
+    batch: int = knob(250, "most pairs of expert and of policy in each gradient step", low=1)
+    penalty: float = knob(1.0, "weight of the gradient penalty; 0 leaves it out", low=0)
+    normalise: str = knob(
+        "standardise",
+        "observation rule: running statistics of the policy, or one of the demonstration",
+        choices=("running", "demo_range", "standardise", "raw"),
+    )
+    clamp: float | None = knob(
+        10.0, "bound on normalised observations; null has none", low=0, low_open=True
+    )
+    hidden: list[int] = knob([100, 100], "hidden layers of the discriminator (tanh)", low=1)
+    seed: int | None = knob(None, "seed of the discriminator; null takes the run's seed", low=0)
+
+
+@dataclass
+class BottleneckConfig(AdversarialConfig):
+    """VAIL's discriminator with its information bottleneck."""
+
+    penalty: float = knob(0.0, "weight of the gradient penalty; 0 leaves it out", low=0)
+    information: float = knob(0.5, "I_c, nats through the bottleneck (paper: 0.5)", low=0)
+    latent: int = knob(8, "size of the bottleneck's code", low=1)
+    beta_start: float = knob(0.0, "first weight of the constraint", low=0)
+    beta_step: float = knob(1e-2, "dual step on that weight for each nat too many", low=0)
+
+
+@dataclass
+class CuriosityConfig:
+    """CDIL's intrinsic curiosity module and the reward made of it."""
+
+    features: str = knob(
+        "inverse",
+        "what trains the features: L_I alone, L_I + L_F, or nothing (random, as released)",
+        choices=("inverse", "both", "none"),
+    )
+    scale: float = knob(1.0, "lambda, the weight of the squared error", low=0, low_open=True)
+    normalise: str = knob(
+        "standardise",
+        "observation rule of the reward model",
+        choices=("demo_range", "standardise", "raw"),
+    )
+    clamp: bool = knob(True, "clamp normalised observations to [-1, 1]")
+    hidden: list[int] = knob([100, 100], "layers of the features (tanh); [] takes none", low=1)
+    model_hidden: list[int] = knob(
+        [100], "hidden layers of inverse and forward model (tanh)", low=1
+    )
+    seed: int | None = knob(None, "seed of the reward model; null takes the run's seed", low=0)
+
+
+@dataclass
 class FitConfig:
     """Training of a reward model on the demonstration."""
 
@@ -154,6 +232,28 @@ class FitConfig:
     batch: int = knob(32, "transitions per gradient step", low=1)
     lr: float = knob(3e-5, "Adam step size", low=0, low_open=True)
     log_every: int = knob(500, "gradient steps between logged losses", low=1)
+
+
+@dataclass
+class BCConfig:
+    """Behaviour cloning: the policy fitted to the demonstrated actions."""
+
+    stop: str = knob(
+        "held_out",
+        "held_out: keep the weights that are best on held-out transitions; fixed: the last ones",
+        choices=("held_out", "fixed"),
+    )
+    steps: int = knob(5_000, "gradient steps", low=1)
+    batch: int = knob(
+        100, "transitions per gradient step; where there are no more, all of them", low=1
+    )
+    lr: float = knob(3e-3, "AdamW step size, decreasing linearly to zero", low=0, low_open=True)
+    weight_decay: float = knob(1.0, "AdamW's weight decay, times the step size", low=0)
+    min_scale: float = knob(0.07, "smallest deviation that observations are divided by", low=0)
+    min_std: float = knob(0.01, "Box: smallest deviation of sampled actions", low=0, low_open=True)
+    log_every: int = knob(
+        100, "gradient steps between logged losses, where held-out ones are compared", low=1
+    )
 
 
 @dataclass
@@ -202,8 +302,25 @@ class RunConfig:
         choices=("tensorboard", "csv", "wandb", "mlflow"),
     )
     threads: int = knob(1, "torch threads; small networks are fastest with 1", low=1)
+    termination: str = knob(
+        "ends",
+        "ends: nothing comes after a failure; bootstrap: its value continues as after a time limit",
+        choices=("ends", "bootstrap"),
+    )
     ppo: PPOConfig = field(default_factory=PPOConfig)
     eval: EvalConfig = field(default_factory=EvalConfig)
+
+
+@dataclass
+class UnaveragedRunConfig(RunConfig):
+    """What recipes share that never average a reward: both profiles give the same run."""
+
+    profile: str = knob(
+        "released",
+        "no effect here: nothing is averaged, both profiles are the same run",
+        choices=("released", "paper"),
+    )
+    batch_mean: bool = knob(True, "no effect here")
 
 
 @dataclass
@@ -213,3 +330,34 @@ class ExpertRunConfig(RunConfig):
     steps: int = knob(5_000_000, "most environment steps of expert training (paper: 5M)", low=1)
     stop_early: bool = knob(True, "stop once the mean return reaches task.expert_score")
     scaling: ScalingConfig = field(default_factory=lambda: ScalingConfig(reset="done"))
+
+
+@dataclass
+class ControlRunConfig(RunConfig):
+    """What the controls' recipe takes; what the chosen reward has no use for is not read."""
+
+    reward: str = knob(
+        "constant",
+        "the reward that stands in for a learned one; random: no reward, a random policy's score",
+        choices=(
+            "constant",
+            "untrained_giril",
+            "untrained_icm",
+            "copy",
+            "noise",
+            "negated_giril",
+            "centred_giril",
+            "random",
+        ),
+    )
+    expert: ExpertConfig = field(default_factory=ExpertConfig)
+    demo: DemoConfig = field(default_factory=DemoConfig)
+    giril: GenerativeConfig = field(default_factory=GenerativeConfig)
+    icm: CuriosityConfig = field(default_factory=CuriosityConfig)
+    fit: FitConfig = field(default_factory=FitConfig)
+    scaling: ScalingConfig = field(default_factory=ScalingConfig)
+
+    @property
+    def needs_demonstration(self) -> bool:
+        """Whether the control is made of a demonstration, and so of an expert."""
+        return self.reward not in ("constant", "random")

@@ -16,13 +16,45 @@ _OWN_PLACE = {"task", "task.name", "seed"}
 NO_EFFECT = frozenset({"out", "root", "logger", "threads"})
 """Keys that change where and how fast a run is made, not its numbers."""
 _LONGEST = 80
+ADDED = {
+    "task.expert_steps": 5_000_000,
+    "task.horizon": "own",
+    "task.after_failure": "reset",
+    "termination": "ends",
+}
+"""Keys that earlier runs did not have, with the value that they behaved by."""
+
+
+def without_added(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested settings less the keys of :data:`ADDED` that have the value given there.
+
+    What is hashed or compared this way is the same as before those keys existed.
+
+    Args:
+        values: nested settings.
+        prefix: dotted key of ``values`` itself, with the dot.
+
+    Examples:
+        >>> without_added({"seed": 1, "task": {"name": "reach", "horizon": "own"}})
+        {'seed': 1, 'task': {'name': 'reach'}}
+        >>> without_added({"termination": "bootstrap"})
+        {'termination': 'bootstrap'}
+    """
+    kept: dict[str, Any] = {}
+    for name, value in values.items():
+        key = f"{prefix}{name}"
+        if isinstance(value, Mapping):
+            kept[name] = without_added(value, f"{key}.")
+        elif key not in ADDED or ADDED[key] != value:
+            kept[name] = value
+    return kept
 
 
 def config_hash(config: Any) -> str:
     """Twelve hex digits of the configuration, less what cannot change a result.
 
     sha256 of the resolved configuration as JSON with sorted keys, without ``out``, ``root``,
-    ``logger`` and ``threads``.
+    ``logger`` and ``threads``, and without later keys at the value they had before they existed.
 
     Args:
         config: an instance of a recipe's ``Config``.
@@ -32,7 +64,8 @@ def config_hash(config: Any) -> str:
         >>> config_hash(RunConfig(seed=1)) == config_hash(RunConfig(seed=1, root="elsewhere"))
         True
     """
-    values = {key: value for key, value in asdict(config).items() if key not in NO_EFFECT}
+    settings = without_added(asdict(config))
+    values = {key: value for key, value in settings.items() if key not in NO_EFFECT}
     return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:12]
 
 

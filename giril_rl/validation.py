@@ -7,7 +7,15 @@ from collections.abc import Callable
 from dataclasses import fields, is_dataclass
 from typing import Any
 
-from giril_rl.configs import DemoConfig, ExpertConfig, PPOConfig, RunConfig
+from giril_rl.configs import (
+    BCConfig,
+    DemoConfig,
+    ExpertConfig,
+    ExpertRunConfig,
+    PPOConfig,
+    RunConfig,
+    TaskConfig,
+)
 from giril_rl.errors import UserError
 from giril_rl.schema import leaves
 
@@ -54,13 +62,51 @@ def _check_steps(key: str, steps: int, ppo: PPOConfig) -> None:
         )
 
 
+def _check_task(key: str, task: TaskConfig) -> None:
+    if task.after_failure != "reset" and task.horizon == "own":
+        raise UserError(
+            f"{key}.after_failure={task.after_failure} means nothing where a failure ends the "
+            f"episode: add {key}.horizon=fixed."
+        )
+
+
+def _check_expert_run(config: ExpertRunConfig) -> None:
+    for key, value, only in (
+        ("task.horizon", config.task.horizon, "own"),
+        ("termination", config.termination, "ends"),
+    ):
+        if value != only:
+            raise UserError(
+                f"{key}={value}: an expert plays the task as it is; leave {key}={only}."
+            )
+
+
+def _check_cloning(config: Any, cloning: BCConfig) -> None:
+    if config.steps:
+        raise UserError(
+            f"steps={config.steps}: cloning takes no environment steps; leave steps=0, bc.steps is "
+            "the number of gradient steps."
+        )
+    if cloning.stop == "held_out" and config.demo.subsample == 1:
+        raise UserError(
+            "bc.stop=held_out needs transitions to hold out and demo.subsample=1 leaves none: "
+            "set demo.subsample to at least 2, or bc.stop=fixed."
+        )
+
+
 def _check_run(config: Any) -> None:
-    if isinstance(config, RunConfig):
+    if isinstance(config, ExpertRunConfig):
+        _check_expert_run(config)
+    cloning = getattr(config, "bc", None)
+    if isinstance(cloning, BCConfig):
+        _check_cloning(config, cloning)
+    elif isinstance(config, RunConfig):
         _check_steps("steps", config.steps, config.ppo)
     expert = getattr(config, "expert", None)
     if isinstance(expert, ExpertConfig) and expert.path is None:
         # The expert that another recipe trains has the settings of PPO that are the default.
-        _check_steps("expert.steps", expert.steps, PPOConfig())
+        key = "task.expert_steps" if expert.steps is None else "expert.steps"
+        _check_steps(key, expert.steps_on(config.task), PPOConfig())
 
 
 def _check_demo(key: str, demo: DemoConfig) -> None:
@@ -78,6 +124,7 @@ def _check_demo(key: str, demo: DemoConfig) -> None:
 
 _PART_CHECKS: dict[type, Callable[[str, Any], None]] = {
     PPOConfig: _check_ppo,
+    TaskConfig: _check_task,
     DemoConfig: _check_demo,
 }
 

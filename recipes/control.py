@@ -1,39 +1,72 @@
-"""Control: PPO on a reward that knows nothing of the demonstration, for comparison."""
+"""Control: PPO on a stand-in for a learned reward, or a random policy's score, for comparison.
+
+A learned reward has shown something only where it does better than these.
+"""
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from torchrl.envs import Compose
 
-from giril_rl.configs import RunConfig, ScalingConfig, knob
+from giril_rl.configs import ControlRunConfig
 from giril_rl.envs import gym_factory, make_env
-from giril_rl.rewards import ConstantReward
-from giril_rl.training import Run, finish_run, make_agent, return_scaling, train_ppo
-from giril_rl.transforms import IntrinsicReward
+from giril_rl.training import (
+    RandomPolicy,
+    Run,
+    Trained,
+    check_inputs,
+    control_reward,
+    finish_run,
+    make_agent,
+    obtain_demonstration,
+    return_scaling,
+    train_ppo,
+)
+from giril_rl.transforms import BatchMeanReward, IntrinsicReward
 
 
 @dataclass
-class Config(RunConfig):
+class Config(ControlRunConfig):
     """What `giril run control` takes."""
-
-    reward: str = knob(
-        "constant", "the reward that stands in for a learned one", choices=["constant"]
-    )
-    scaling: ScalingConfig = field(default_factory=ScalingConfig)
 
 
 def main(cfg: Config, out: Path) -> None:
     """Train a policy on the control reward and leave its run folder in ``out``."""
-    gym_factory(cfg.task)  # Refuses an unknown environment before a folder is made.
+    method = f"control:{cfg.reward}"
+    if cfg.needs_demonstration:
+        check_inputs(cfg, cfg.expert, cfg.demo)
+    else:
+        gym_factory(cfg.task)  # Refuses an unknown environment before a folder is made.
+    player = RandomPolicy.of_task(cfg.task) if cfg.reward == "random" else None
     with Run.open(out, asdict(cfg), recipe="control", logger=cfg.logger) as run:
         if run.finished:
             return
+        if player is not None:
+            finish_run(run, cfg, player, Trained(0, 0.0), method=method)
+            return
+        demo, expert = None, None
+        if cfg.needs_demonstration:
+            demo, expert = obtain_demonstration(cfg, cfg.expert, cfg.demo)
         env = make_env(cfg.task, cfg.ppo.num_envs, cfg.seed)
+
+        reward, seeds = control_reward(cfg, env, demo, run)
+
         relabel = Compose(
-            IntrinsicReward(ConstantReward()), *return_scaling(cfg.scaling, cfg.ppo.gamma)
+            IntrinsicReward(reward),
+            *([BatchMeanReward()] if cfg.batch_mean else []),
+            *return_scaling(cfg.scaling, cfg.ppo.gamma),
         )
         agent = make_agent(env, cfg.ppo, cfg.seed)
-        trained = train_ppo(env, agent, relabel, cfg.ppo, steps=cfg.steps, seed=cfg.seed, run=run)
-        finish_run(run, cfg, agent, trained, method=f"control:{cfg.reward}")
+        trained = train_ppo(
+            env,
+            agent,
+            relabel,
+            cfg.ppo,
+            steps=cfg.steps,
+            seed=cfg.seed,
+            run=run,
+            termination=cfg.termination,
+        )
+        finish_run(run, cfg, agent, trained, method=method, expert=expert, demo=demo, seeds=seeds)

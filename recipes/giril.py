@@ -83,7 +83,16 @@ def main(cfg: Config, out: Path) -> None:
             *return_scaling(cfg.scaling, cfg.ppo.gamma),
         )
         agent = make_agent(env, cfg.ppo, cfg.seed)
-        trained = train_ppo(env, agent, relabel, cfg.ppo, steps=cfg.steps, seed=cfg.seed, run=run)
+        trained = train_ppo(
+            env,
+            agent,
+            relabel,
+            cfg.ppo,
+            steps=cfg.steps,
+            seed=cfg.seed,
+            run=run,
+            termination=cfg.termination,
+        )
         finish_run(
             run,
             cfg,

@@ -56,6 +56,13 @@ def test_expert_trains_for_five_million_steps():
     assert resolved(expert, config_class(expert), [])[0].steps == 5_000_000
 
 
+@pytest.mark.parametrize("recipe", shipped(), ids=lambda recipe: recipe.name)
+def test_the_task_says_how_long_an_expert_is_trained(recipe):
+    config = resolved(recipe, config_class(recipe), ["task.expert_steps=700000"])[0]
+    found = config.steps if recipe.name == "expert" else config.expert.steps_on(config.task)
+    assert found == 700_000
+
+
 @pytest.mark.parametrize(("profile", "mean"), [("released", True), ("paper", False)])
 def test_profiles(profile, mean):
     config = config_of(f"profile={profile}")
@@ -97,7 +104,9 @@ def test_every_shipped_recipe_composes_with_every_choice(recipe):
         (["hydra.x=1"], "'hydra.x' is not a key of giril: see `giril run giril --help`."),
         (
             ["task=foo"],
-            "task=foo: choose one of gymnasium, inverted_double_pendulum, inverted_pendulum.",
+            "task=foo: choose one of ant, gymnasium, half_cheetah, hopper, "
+            "inverted_double_pendulum, inverted_pendulum, inverted_pendulum_swingup, reacher, "
+            "walker2d.",
         ),
         (["profile=foo"], "profile=foo: choose one of paper, released."),
         (["seed=abc"], "seed=abc: a whole number is needed."),

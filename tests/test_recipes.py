@@ -37,7 +37,16 @@ GIRIL = [
     "reward.hidden=[16]",
     "reward.beta=0.7",  # Then the reward is noisy: more to save and restore.
 ]
-EXTRA = {"giril": GIRIL, "expert": ["stop_early=false"], "control": []}
+CDIL = [word for word in GIRIL if "beta" not in word]
+ADVERSARIAL = [word for word in CDIL if "fit" not in word] + ["reward.penalty=1"]
+EXTRA = {
+    "giril": GIRIL,
+    "cdil": CDIL,
+    "gail": ADVERSARIAL,
+    "vail": ADVERSARIAL,
+    "expert": ["stop_early=false"],
+    "control": [],
+}
 
 SCORES = ["return_mean", "return_std", "return_median", "episode_length_mean", "episodes"]
 FIELDS = [
@@ -112,16 +121,21 @@ def test_a_recipe_leaves_a_whole_result(recipe, root, tmp_path, capsys):
     assert_whole(tmp_path / "run", result, recipe, "CartPole-v1", 4 * BATCH)
     printed = capsys.readouterr().out
     assert f"{result['return_mean']:,.1f}" in printed
-    if recipe == "giril":
-        assert result["demo_transitions"] == 100
-        assert math.isfinite(result["expert_return_mean"]) and result["demo_return_mean"] > 5
-        fit = [row for row in timeless(tmp_path / "run") if row["phase"] == "fit"]
-        assert [row["step"] for row in fit] == [10, 20]
-        expert = json.loads(next(root.glob("expert/*/*/result.json")).read_text())
-        assert result["expert_return_mean"] == expert["return_mean"]
-    else:
+    if recipe in ("expert", "control"):
         keys = ("expert_return_mean", "demo_return_mean", "demo_transitions")
         assert [result[key] for key in keys] == [None] * 3
+    else:
+        assert result["demo_transitions"] == 100
+        assert math.isfinite(result["expert_return_mean"]) and result["demo_return_mean"] > 5
+        expert = json.loads(next(root.glob("expert/*/*/result.json")).read_text())
+        assert result["expert_return_mean"] == expert["return_mean"]
+    if recipe in ("giril", "cdil"):
+        fit = [row for row in timeless(tmp_path / "run") if row["phase"] == "fit"]
+        assert [row["step"] for row in fit] == [10, 20]
+    if recipe in ("gail", "vail"):
+        row = timeless(tmp_path / "run")[-1]
+        assert math.isfinite(row["discriminator/loss_expert"])
+        assert ("discriminator/beta" in row) == (recipe == "vail")
     # What was saved is what was scored.
     assert main(["eval", str(tmp_path / "run")]) == 0
     again = json.loads((tmp_path / "run" / "eval.json").read_text())

@@ -6,6 +6,7 @@ import pytest
 from giril_rl.configs import (
     DemoConfig,
     ExpertConfig,
+    ExpertRunConfig,
     FitConfig,
     GenerativeConfig,
     PPOConfig,
@@ -124,6 +125,41 @@ def test_steps_of_the_expert_are_whole_batches():
         validate(config)
     config.expert.path = "somewhere"
     validate(config)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "sentence"),
+    [
+        ("horizon", "long", "task.horizon=long: choose one of own, fixed."),
+        ("after_failure", "x", "task.after_failure=x: choose one of reset, continue."),
+        (
+            "after_failure",
+            "continue",
+            "task.after_failure=continue means nothing where a failure ends the episode: "
+            "add task.horizon=fixed.",
+        ),
+    ],
+)
+def test_the_horizon(key, value, sentence):
+    config = good()
+    setattr(config.task, key, value)
+    with pytest.raises(UserError) as refusal:
+        validate(config)
+    assert str(refusal.value) == sentence
+    config.task.horizon, config.task.after_failure = "fixed", "continue"
+    validate(config)
+
+
+def test_an_expert_plays_the_task_as_it_is():
+    task = TaskConfig(name="reach", env_id="Reach-v0")
+    validate(ExpertRunConfig(task=task))
+    with pytest.raises(
+        UserError, match=r"^termination=bootstrap: an expert .* termination=ends\.$"
+    ):
+        validate(ExpertRunConfig(task=task, termination="bootstrap"))
+    task.horizon = "fixed"
+    with pytest.raises(UserError, match=r"^task\.horizon=fixed: an expert .* task\.horizon=own\.$"):
+        validate(ExpertRunConfig(task=task))
 
 
 @pytest.mark.parametrize(

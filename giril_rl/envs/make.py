@@ -5,10 +5,13 @@ from __future__ import annotations
 import contextlib
 import importlib
 from collections.abc import Callable
+from dataclasses import replace
+from typing import cast
 
 import gymnasium
 
 from giril_rl.configs import TaskConfig
+from giril_rl.envs.fixed import AfterFailure, FixedHorizonEnv
 from giril_rl.envs.vector import GymVectorEnv, silent_stdout
 from giril_rl.errors import UserError
 from giril_rl.nearest import did_you_mean
@@ -63,7 +66,7 @@ def make_env(task: TaskConfig, num_envs: int, seed: int) -> GymVectorEnv:
     """``num_envs`` environments of ``task`` as one TorchRL environment.
 
     Args:
-        task: the task.
+        task: the task; ``task.horizon="fixed"`` makes a :class:`FixedHorizonEnv`.
         num_envs: batch size.
         seed: root of the episodes' seeds.
 
@@ -75,7 +78,25 @@ def make_env(task: TaskConfig, num_envs: int, seed: int) -> GymVectorEnv:
         >>> env.reset()["observation"].shape
         torch.Size([3, 4])
     """
+    if task.horizon == "fixed":
+        return FixedHorizonEnv(
+            gym_factory(task),
+            num_envs,
+            after_failure=cast(AfterFailure, task.after_failure),
+            seed=seed,
+        )
     return GymVectorEnv(gym_factory(task), num_envs, seed=seed)
+
+
+def with_own_episodes(task: TaskConfig) -> TaskConfig:
+    """The task with its own episodes, which end at a failure: what experts and scores play.
+
+    Examples:
+        >>> fixed = TaskConfig(name="cartpole", env_id="CartPole-v1", horizon="fixed")
+        >>> with_own_episodes(fixed).horizon
+        'own'
+    """
+    return replace(task, horizon="own", after_failure="reset")
 
 
 def _import(package: str) -> None:

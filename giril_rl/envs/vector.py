@@ -28,6 +28,9 @@ class GymVectorEnv(EnvBase):
     index and the episode's number, so that any moment of a run can be rebuilt by replaying the
     actions since the last reset (:meth:`simulator_state`, :meth:`restore_simulator`).
 
+    A copy is stepped with the action clamped to its bounds: most simulators clamp by themselves
+    before they act, but some pay for the action as it was given.
+
     TorchRL's own ``GymWrapper(SyncVectorEnv(...))`` gives the same transitions; this class exists
     because it is 1.4 times as fast for simulators that step in tens of microseconds
     (``tests/benchmarks/parts.py``), and because Gymnasium has no way to save a simulator's state.
@@ -49,6 +52,9 @@ class GymVectorEnv(EnvBase):
         >>> env.rollout(10, break_when_any_done=False)["next", "observation"].shape
         torch.Size([4, 10, 4])
     """
+
+    _onward_key = "observation"
+    """Entry of ``next`` from which a copy goes on whose episode has not ended."""
 
     def __init__(
         self,
@@ -90,6 +96,8 @@ class GymVectorEnv(EnvBase):
             observation=Unbounded((n, *observation.shape), dtype=torch.float32), shape=(n,)
         )
         self.action_spec = _action_spec(action, n, name)
+        bounded = isinstance(self.action_spec, Bounded)
+        self._bounds = (action.low, action.high) if bounded else None  # type: ignore[attr-defined]
         self.reward_spec = Unbounded((n, 1), dtype=torch.float32)
         flag = Categorical(2, shape=(n, 1), dtype=torch.bool)
         self.done_spec = Composite(
@@ -100,7 +108,8 @@ class GymVectorEnv(EnvBase):
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         # A copy, for the caller may reuse its memory and the history may not change.
-        actions = tensordict.get("action").numpy().copy()
+        actions = tensordict.get("action").numpy()
+        actions = actions.copy() if self._bounds is None else actions.clip(*self._bounds)
         self._actions.append(actions)
         n = len(self._gym_envs)
         observation = np.empty_like(self._last_observation)
@@ -142,7 +151,7 @@ class GymVectorEnv(EnvBase):
         if done.any():
             observation = torch.from_numpy(self._reset_where(done.view(-1).numpy()))
         else:
-            observation = following.get("observation")
+            observation = following.get(self._onward_key)
         return tensordict, self._root(observation)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
@@ -170,16 +179,24 @@ class GymVectorEnv(EnvBase):
         )
 
     def _reset_where(self, mask: np.ndarray) -> np.ndarray:
+        self._steps[mask] = 0
+        return self._restart(mask)
+
+    def _restart(self, mask: np.ndarray) -> np.ndarray:
+        """Resets simulators, each with its next episode's seed; what all copies then show."""
         observation = self._last_observation.copy()
         with silent_stdout() if not self._started else contextlib.nullcontext():
             for i in np.flatnonzero(mask).tolist():
                 observation[i], _ = self._gym_envs[i].reset(seed=self._episode_seed(i))
                 self._episode[i] += 1
-                self._steps[i] = 0
         self._started = True
         self._last_observation = observation
-        del self._actions[: len(self._actions) - int(self._steps.max())]
+        del self._actions[: len(self._actions) - int(self._replayed().max())]
         return observation
+
+    def _replayed(self) -> np.ndarray:
+        """How many actions lead each copy from its simulator's last reset to where it stands."""
+        return self._steps
 
     def _episode_seed(self, index: int) -> int:
         entropy = [self._root_seed, index, int(self._episode[index])]
@@ -217,10 +234,11 @@ class GymVectorEnv(EnvBase):
         """
         self._root_seed = int(state["seed"])
         self._episode = state["episode"].numpy().copy()
-        steps = state["steps"].numpy()
+        self._steps = state["steps"].numpy().copy()
+        self._restore_clocks(state)
+        steps = self._replayed()
         actions = state["actions"].numpy()
         self._actions = list(actions) if steps.max() else []
-        self._steps = steps.copy()
         observation = np.empty_like(self._last_observation)
         with silent_stdout():
             for i, env in enumerate(self._gym_envs):
@@ -236,6 +254,9 @@ class GymVectorEnv(EnvBase):
             )
         self._last_observation = observation
         self._started = self._restored = True
+
+    def _restore_clocks(self, state: dict[str, Any]) -> None:
+        """Takes what a subclass added to :meth:`simulator_state`."""
 
     def close(self, *, raise_if_closed: bool = True) -> None:
         """Closes every copy."""

@@ -49,6 +49,22 @@ class RunningNormaliser(nn.Module):
         return ((observation - self.shift) * self.factor).clamp_(-self.clip, self.clip)
 
     @torch.no_grad()
+    def fit(self, observation: Tensor, *, least: float = 0.0) -> None:
+        """Replaces the statistics by those of ``(*batch, size)`` alone.
+
+        Args:
+            observation: raw observations.
+            least: smallest deviation to divide by. A good player hardly moves some of its
+                observations; divided by so little, what it never saw would be far out of range.
+        """
+        batch = observation.reshape(-1, observation.shape[-1]).double()
+        self.mean.copy_(batch.mean(0))
+        self.var.copy_(batch.var(0, correction=0).clamp(min=least**2))
+        self.count.fill_(len(batch))
+        self.shift.copy_(self.mean)
+        self.factor.copy_((self.var + self.eps).rsqrt())
+
+    @torch.no_grad()
     def update(self, observation: Tensor) -> None:
         """Merges ``(*batch, size)`` into the statistics (Chan et al. 1983)."""
         batch = observation.reshape(-1, observation.shape[-1]).double()

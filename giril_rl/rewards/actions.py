@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import torch
-import torch.nn.functional as F
 from torch import Tensor, nn
 from torchrl.data import (
     Binary,
@@ -84,7 +83,9 @@ class ActionEncoder(nn.Module):
         if self.one_hot:
             return action.to(torch.get_default_dtype())
         if self.discrete:
-            return F.one_hot(action.long(), self.size).to(torch.get_default_dtype())
+            # Not F.one_hot, which looks at the values and so cannot be recorded as a graph.
+            zeros = torch.zeros(*action.shape, self.size, device=action.device)
+            return zeros.scatter(-1, action.long().unsqueeze(-1), 1.0)
         clamped = torch.clamp(action.to(self.low.dtype), self.low, self.high)
         return (clamped - self.offset) * self.scale
 

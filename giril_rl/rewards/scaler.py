@@ -24,7 +24,8 @@ class ObservationScaler(nn.Module):
             and 1, ``"standardise"`` its mean to 0 and its (population) standard deviation to 1,
             ``"raw"`` leaves observations as they are and needs no :meth:`fit`. A dimension that is
             constant in the demonstration is only shifted to 0.
-        clamp: clamp the result to [-1, 1].
+        clamp: clamp the result to [-limit, limit].
+        limit: the bound.
 
     Raises:
         UserError: for an unknown rule, for a demonstration that cannot be fitted, or when used
@@ -42,7 +43,12 @@ class ObservationScaler(nn.Module):
     fitted: Tensor
 
     def __init__(
-        self, observation_dim: int, *, rule: ScalingRule = "standardise", clamp: bool = True
+        self,
+        observation_dim: int,
+        *,
+        rule: ScalingRule = "standardise",
+        clamp: bool = True,
+        limit: float = 1.0,
     ) -> None:
         super().__init__()
         if rule not in get_args(ScalingRule):
@@ -51,6 +57,7 @@ class ObservationScaler(nn.Module):
             )
         self.rule: ScalingRule = rule
         self.clamp = clamp
+        self.limit = limit
         self.register_buffer("offset", torch.zeros(observation_dim))
         self.register_buffer("scale", torch.ones(observation_dim))
         self.register_buffer("fitted", torch.tensor(rule == "raw"))
@@ -96,7 +103,7 @@ class ObservationScaler(nn.Module):
         scaled = observation.to(self.offset.dtype)
         if self.rule != "raw":
             scaled = (scaled - self.offset) * self.scale
-        return scaled.clamp(-1.0, 1.0) if self.clamp else scaled
+        return scaled.clamp(-self.limit, self.limit) if self.clamp else scaled
 
     def extra_repr(self) -> str:
         """Shows rule and clamp when printed."""

@@ -1,19 +1,30 @@
 """The loops that recipes share: fit a reward, PPO on a reward, score, keep and resume."""
 
+from giril_rl.training.adversarial import AdversarialLearner
 from giril_rl.training.agent import load_agent, make_agent, save_agent
+from giril_rl.training.clone import clone_behaviour
+from giril_rl.training.control_rewards import control_reward
 from giril_rl.training.evaluate import Scores, evaluate, evaluate_both
 from giril_rl.training.expert import check_inputs, obtain_demonstration, train_expert
 from giril_rl.training.fit import fit_reward
-from giril_rl.training.ppo import PPOLearner, train_ppo
+from giril_rl.training.ppo import PPOLearner, Trained, train_ppo
+from giril_rl.training.random_policy import RandomPolicy
 from giril_rl.training.result import finish_run
+from giril_rl.training.reward_learner import RewardLearner
 from giril_rl.training.run import Run
 from giril_rl.training.scaling import return_scaling
 
 __all__ = [
+    "AdversarialLearner",
     "PPOLearner",
+    "RandomPolicy",
+    "RewardLearner",
     "Run",
     "Scores",
+    "Trained",
     "check_inputs",
+    "clone_behaviour",
+    "control_reward",
     "evaluate",
     "evaluate_both",
     "finish_run",

@@ -10,6 +10,10 @@ from torch import Tensor, nn
 class EpisodeTracker(nn.Module):
     """Follows undiscounted true returns across batches, whole batches at a time.
 
+    Where a batch has ``("next", "scored")`` (see :class:`giril_rl.envs.FixedHorizonEnv`), only
+    those steps count, so that returns and lengths are those of the task's own episodes: one for each
+    horizon, from its beginning to the first failure.
+
     Args:
         num_envs: environments in a batch.
 
@@ -39,7 +43,13 @@ class EpisodeTracker(nn.Module):
         """Takes a batch ``(num_envs, time)``; gives returns and lengths of episodes ended in it."""
         reward = batch.get(("next", "reward")).squeeze(-1).double()
         done = batch.get(("next", "done")).squeeze(-1)
-        time = torch.arange(1, done.shape[1] + 1).expand_as(done)
+        scored = batch.get(("next", "scored"), None)
+        if scored is None:
+            time = torch.arange(1, done.shape[1] + 1).expand_as(done)
+        else:
+            scored = scored.squeeze(-1)
+            reward = torch.where(scored, reward, 0.0)
+            time = scored.cumsum(1)
         total = torch.cat([-self.running_return.unsqueeze(1), reward.cumsum(1)], 1)
         clock = torch.cat([-self.running_length.unsqueeze(1), time], 1)
         end = torch.cat([torch.ones_like(done[:, :1]), done], 1)

@@ -2,15 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from typing import Protocol
 
 import torch
+from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from giril_rl.configs import TaskConfig
-from giril_rl.envs import make_env
-from giril_rl.networks.policy import ActorCritic
+from giril_rl.envs import make_env, with_own_episodes
+
+
+class Player(Protocol):
+    """Whatever can be scored, such as :class:`~giril_rl.networks.policy.ActorCritic`."""
+
+    def acting(self) -> Callable[[TensorDictBase], TensorDictBase]:
+        """What writes ``"action"`` for a batch of ``"observation"``."""
+        ...
 
 
 @dataclass
@@ -30,7 +40,7 @@ class Scores:
 
 
 def evaluate(
-    agent: ActorCritic,
+    agent: Player,
     task: TaskConfig,
     *,
     episodes: int,
@@ -44,7 +54,7 @@ def evaluate(
 
     Args:
         agent: the policy; its running normalisation is used as it is and not updated.
-        task: the task to play.
+        task: the task to play; always its own episodes, whatever ``task.horizon`` says.
         episodes: number of episodes.
         seed: root of the episodes' seeds and seed of the sampled actions.
         deterministic: play the distribution's mode rather than samples.
@@ -53,6 +63,7 @@ def evaluate(
         The scores; the standard deviation is the sample's (n - 1), 0 for one episode.
 
     Examples:
+        >>> from giril_rl.networks.policy import ActorCritic
         >>> task = TaskConfig(name="cartpole", env_id="CartPole-v1")
         >>> env = make_env(task, num_envs=1, seed=0)
         >>> scores = evaluate(
@@ -61,7 +72,7 @@ def evaluate(
         >>> scores.episodes, scores.return_mean == scores.episode_length_mean
         (5, True)
     """
-    env = make_env(task, episodes, seed)
+    env = make_env(with_own_episodes(task), episodes, seed)
     policy = agent.acting()
     mode = ExplorationType.DETERMINISTIC if deterministic else ExplorationType.RANDOM
     returns = torch.zeros(episodes, dtype=torch.float64)
@@ -89,7 +100,7 @@ def evaluate(
 
 
 def evaluate_both(
-    agent: ActorCritic, task: TaskConfig, *, episodes: int, seed: int
+    agent: Player, task: TaskConfig, *, episodes: int, seed: int
 ) -> dict[str, object]:
     """Scores of the policy as it was trained, sampling; of its mode under ``"deterministic"``.
 

@@ -19,9 +19,9 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from giril_rl.configs import DemoConfig, ExpertConfig, ExpertRunConfig, RunConfig, TaskConfig
 from giril_rl.demos import Demonstration, check_demonstration, record_demonstration
-from giril_rl.envs import gym_factory, make_env
+from giril_rl.envs import gym_factory, make_env, with_own_episodes
 from giril_rl.errors import UserError
-from giril_rl.naming import out_folder, safe
+from giril_rl.naming import out_folder, safe, without_added
 from giril_rl.networks.policy import ActorCritic
 from giril_rl.training.agent import load_agent, make_agent
 from giril_rl.training.finished import read_result, read_settings
@@ -83,11 +83,11 @@ def obtain_expert(cfg: RunConfig, expert: ExpertConfig) -> tuple[Path, dict[str,
             )
         return folder, result
     settings = ExpertRunConfig(
-        task=cfg.task,
+        task=with_own_episodes(cfg.task),
         root=cfg.root,
         logger=cfg.logger,
         threads=cfg.threads,
-        steps=expert.steps,
+        steps=expert.steps_on(cfg.task),
         seed=expert.seed,
         stop_early=expert.stop_early,
     )
@@ -136,7 +136,8 @@ def obtain_demonstration(
         return _given_demonstration(cfg.task, demo.path), None
     source, result = obtain_expert(cfg, expert)
     settings = {k: v for k, v in asdict(demo).items() if k not in ("path", "subsample")}
-    identity = json.dumps([settings, asdict(cfg.task), result["config_hash"]], sort_keys=True)
+    task = without_added({"task": asdict(with_own_episodes(cfg.task))})["task"]
+    identity = json.dumps([settings, task, result["config_hash"]], sort_keys=True)
     digest = hashlib.sha256(identity.encode()).hexdigest()[:12]
     folder = Path(cfg.root) / "demos" / safe(cfg.task.name) / digest
     with made_once(folder, "demonstration"):

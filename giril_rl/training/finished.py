@@ -12,7 +12,8 @@ from giril_rl.configs import EvalConfig, PPOConfig, TaskConfig
 from giril_rl.errors import UserError
 from giril_rl.files import read_json, write_json
 from giril_rl.training.agent import load_agent
-from giril_rl.training.evaluate import evaluate_both
+from giril_rl.training.evaluate import Player, evaluate_both
+from giril_rl.training.random_policy import RANDOM, RandomPolicy
 
 Part = TypeVar("Part")
 
@@ -62,9 +63,10 @@ def evaluate_run(folder: Path, episodes: int | None = None, seed: int | None = N
     Raises:
         UserError: if the folder holds no finished run.
     """
-    read_result(folder)
+    method = read_result(folder)["method"]
     task, ppo, settings = read_settings(folder)
-    agent = load_agent(folder, task, ppo)
+    agent: Player
+    agent = RandomPolicy.of_task(task) if method == RANDOM else load_agent(folder, task, ppo)
     episodes = settings.episodes if episodes is None else episodes
     seed = settings.seed if seed is None else seed
     scores = evaluate_both(agent, task, episodes=episodes, seed=seed)

@@ -16,6 +16,7 @@ from torchrl.objectives.value import GAE
 
 from giril_rl.configs import PPOConfig
 from giril_rl.envs.vector import GymVectorEnv
+from giril_rl.errors import UserError
 from giril_rl.networks.policy import NORMALISED, ActorCritic
 from giril_rl.progress import progress
 from giril_rl.training.episodes import EpisodeTracker
@@ -23,6 +24,7 @@ from giril_rl.training.interrupt import Interrupt, Interrupted
 from giril_rl.training.traced import TracedGradients
 
 if TYPE_CHECKING:
+    from giril_rl.training.reward_learner import RewardLearner
     from giril_rl.training.run import Run
 
 LEARNER_KEYS = (
@@ -32,6 +34,8 @@ LEARNER_KEYS = (
     "advantage",
     "value_target",
 )
+NO_FAILURE = "no_failure"
+"""Stands for ``"terminated"`` where a failure is taken for a time limit: False everywhere."""
 
 
 class Trained(NamedTuple):
@@ -52,6 +56,8 @@ def train_ppo(
     run: Run,
     phase: str = "ppo",
     stop_at: float | None = None,
+    learn_reward: RewardLearner | None = None,
+    termination: str = "ends",
 ) -> Trained:
     """Trains ``agent`` in place on the reward that ``relabel`` writes; resumes by itself.
 
@@ -71,6 +77,9 @@ def train_ppo(
         phase: name of the checkpoint and of the metrics.
         stop_at: ends training once the mean true return of the last 20 training episodes reaches
             this. Only an expert, which may see the true reward, is trained with it.
+        learn_reward: trains the reward model beside the policy, on each batch before ``relabel``
+            uses it; its state is checkpointed.
+        termination: "ends" or "bootstrap", see :class:`PPOLearner`.
 
     Returns:
         Environment steps and seconds, those of earlier processes included.
@@ -78,7 +87,7 @@ def train_ppo(
     Raises:
         Interrupted: after a checkpoint, if the user asked for it with Ctrl-C.
     """
-    learner = PPOLearner(agent, cfg, total_steps=steps)
+    learner = PPOLearner(agent, cfg, total_steps=steps, termination=termination)
     tracker = EpisodeTracker(cfg.num_envs)
     recent: deque[float] = deque(maxlen=20)
     parts = nn.ModuleDict({"agent": agent, "tracker": tracker, "relabel": relabel})
@@ -107,6 +116,8 @@ def train_ppo(
     if saved is not None:
         parts.load_state_dict(saved["parts"])
         learner.optimizer.load_state_dict(saved["optimizer"])
+        if learn_reward is not None:
+            learn_reward.load_state_dict(saved["reward_learner"])
         torch.set_rng_state(saved["rng"])
     run.truncate_metrics(phase, taken)
     next_save = (taken // cfg.checkpoint_every + 1) * cfg.checkpoint_every
@@ -124,9 +135,11 @@ def train_ppo(
             started = time.perf_counter()
             returns, lengths = tracker(batch)
             recent.extend(returns.tolist())
+            learned = {} if learn_reward is None else learn_reward.update(batch)
             losses = learner.learn(relabel(batch), taken)
             taken += batch_size
             metrics = {f"{phase}/{k}": v for k, v in losses.items()}
+            metrics.update(learned)
             metrics[f"{phase}/update_seconds"] = time.perf_counter() - started
             metrics[f"{phase}/reward_mean"] = batch.get(("next", "reward")).mean().item()
             metrics["train/episodes"] = float(len(returns))
@@ -149,6 +162,7 @@ def train_ppo(
                     "optimizer": learner.optimizer.state_dict(),
                     "simulator": env.simulator_state(),
                     "rng": torch.get_rng_state(),
+                    "reward_learner": None if learn_reward is None else learn_reward.state_dict(),
                 }
                 run.save(phase, state)
             if stopped:
@@ -165,9 +179,17 @@ class PPOLearner:
         agent: policy and value network.
         cfg: settings of PPO.
         total_steps: environment steps of the whole training, for a decreasing step size.
+        termination: "ends" (nothing is worth anything after a failure) or "bootstrap" (a failure is
+            taken for a time limit: the value of the terminal observation continues). Either way
+            ``done`` ends the episode, beyond which advantages do not look.
     """
 
-    def __init__(self, agent: ActorCritic, cfg: PPOConfig, *, total_steps: int) -> None:
+    def __init__(
+        self, agent: ActorCritic, cfg: PPOConfig, *, total_steps: int, termination: str = "ends"
+    ) -> None:
+        if termination not in ("ends", "bootstrap"):
+            raise UserError(f"termination={termination}: choose one of ends, bootstrap.")
+        self.bootstraps_failure = termination == "bootstrap"
         self.agent = agent
         self.cfg = cfg
         self.total_steps = total_steps
@@ -177,6 +199,8 @@ class PPOLearner:
         self.advantage = GAE(
             gamma=cfg.gamma, lmbda=cfg.lmbda, value_network=critic, average_gae=True
         )
+        if self.bootstraps_failure:
+            self.advantage.set_keys(terminated=NO_FAILURE)
         loss = RecordableClipPPOLoss(
             agent.actor_for_loss(),
             critic,
@@ -215,8 +239,14 @@ class PPOLearner:
             for group in self.optimizer.param_groups:
                 group["lr"] = cfg.lr * (1 - taken / self.total_steps)
         with torch.no_grad():
-            following = self.agent.normaliser(batch.get(("next", "observation")))
-            batch.set(("next", NORMALISED), following)
+            # Where the environment was reset unnoticed, the value is that of where it goes on.
+            following = batch.get(("next", "following_observation"), None)
+            if following is None:
+                following = batch.get(("next", "observation"))
+            batch.set(("next", NORMALISED), self.agent.normaliser(following))
+            if self.bootstraps_failure:
+                failed = batch.get(("next", "terminated"))
+                batch.set(("next", NO_FAILURE), torch.zeros_like(failed))
             self.advantage(batch)
         flat = [batch.get(key).flatten(0, 1) for key in LEARNER_KEYS]
         for _ in range(cfg.epochs):

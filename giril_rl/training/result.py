@@ -10,17 +10,19 @@ from giril_rl.demos import Demonstration
 from giril_rl.naming import config_hash
 from giril_rl.networks.policy import ActorCritic
 from giril_rl.report.curve import write_curve
+from giril_rl.report.losses import loss_points, write_losses
 from giril_rl.training.agent import save_agent
 from giril_rl.training.evaluate import evaluate_both
 from giril_rl.training.metrics import read_metrics
 from giril_rl.training.ppo import Trained
+from giril_rl.training.random_policy import RandomPolicy
 from giril_rl.training.run import Run
 
 
 def finish_run(
     run: Run,
     cfg: RunConfig,
-    agent: ActorCritic,
+    agent: ActorCritic | RandomPolicy,
     trained: Trained,
     *,
     method: str,
@@ -33,7 +35,7 @@ def finish_run(
     Args:
         run: the run's folder.
         cfg: the run's settings.
-        agent: the trained policy.
+        agent: the trained policy, or the random one, of which there is nothing to save.
         trained: its steps and seconds.
         method: the method's name in tables.
         expert: the expert's result, if there was one.
@@ -43,12 +45,15 @@ def finish_run(
     Returns:
         What ``result.json`` holds.
     """
-    save_agent(agent, run.folder)
+    if isinstance(agent, ActorCritic):
+        save_agent(agent, run.folder)
     scores = evaluate_both(agent, cfg.task, episodes=cfg.eval.episodes, seed=cfg.eval.seed)
     result: dict[str, Any] = {
         "method": method,
         "task": cfg.task.name,
         "profile": cfg.profile,
+        "horizon": cfg.task.horizon,
+        "termination": cfg.termination,
         "seed": cfg.seed,
         "seeds": {"policy": cfg.seed, "evaluation": cfg.eval.seed, **(seeds or {})},
         "env_steps": trained.steps,
@@ -62,18 +67,21 @@ def finish_run(
         "versions": run.versions,
         "finished_at": datetime.now(UTC).isoformat(timespec="seconds"),
     }
-    write_curve(
-        run.folder,
-        read_metrics(run.folder / "metrics.jsonl"),
-        recipe=method,
-        task=cfg.task.name,
-        seed=cfg.seed,
-        expert_return=result["expert_return_mean"],
-        demo_return=result["demo_return_mean"],
-        final_return=result["return_mean"],
-        final_std=result["return_std"],
-        final_step=trained.steps,
-    )
+    rows = read_metrics(run.folder / "metrics.jsonl")
+    names: dict[str, Any] = {"recipe": method, "task": cfg.task.name, "seed": cfg.seed}
+    if loss_points(rows):
+        write_losses(run.folder, rows, final_return=result["return_mean"], **names)
+    else:
+        write_curve(
+            run.folder,
+            rows,
+            expert_return=result["expert_return_mean"],
+            demo_return=result["demo_return_mean"],
+            final_return=result["return_mean"],
+            final_std=result["return_std"],
+            final_step=trained.steps,
+            **names,
+        )
     run.finish(result)
     return result
 

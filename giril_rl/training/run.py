@@ -14,7 +14,7 @@ from filelock import FileLock, Timeout
 
 from giril_rl.errors import UserError
 from giril_rl.files import installed_versions, read_json, write_atomically, write_json
-from giril_rl.naming import NO_EFFECT
+from giril_rl.naming import NO_EFFECT, without_added
 from giril_rl.training.checkpoint import load_state, save_state
 from giril_rl.training.metrics import MetricsFile, check_logger, make_logger
 
@@ -238,7 +238,7 @@ def _differences(
     before: Mapping[str, Any], now: Mapping[str, Any], ignore: Collection[str]
 ) -> list[str]:
     """``"ppo.lr: 0.1 there, 0.2 now"`` for each dotted key whose values differ."""
-    old, new = _flatten(before), _flatten(now)
+    old, new = _flatten(without_added(before)), _flatten(without_added(now))
     return [
         f"{key}: {old.get(key, 'nothing')!s} there, {new.get(key, 'nothing')!s} now"
         for key in [*new, *(key for key in old if key not in new)]

@@ -26,7 +26,8 @@ class TracedGradients:
 
     Args:
         loss: called with a TensorDict; the entries named ``loss_*`` are summed and differentiated.
-        keys: entries of the batch that the loss reads.
+        keys: entries of the batch that the loss reads; where their lengths differ, the TensorDict
+            that it is called with has no batch dimension.
         log: further scalar entries of the loss's output to return.
         max_grad_norm: joint norm above which the gradients are scaled down to it, as
             :func:`torch.nn.utils.clip_grad_norm_` does; None leaves them.
@@ -97,7 +98,8 @@ class TracedGradients:
             with torch.enable_grad():
                 leaves = [p.detach().requires_grad_() for p in tensors[:count]]
                 values = dict(zip(self._keys, tensors[count:], strict=True))
-                batch = TensorDict(values, inputs[0].shape[:1])
+                sizes = {x.shape[:1] for x in inputs}
+                batch = TensorDict(values, sizes.pop() if len(sizes) == 1 else ())
                 parameters = dict(zip(self._names, leaves, strict=True))
                 out = torch.func.functional_call(self._loss, parameters, (batch,))
                 losses = {k: v for k, v in out.items() if str(k).startswith("loss_")}

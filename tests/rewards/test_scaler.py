@@ -40,6 +40,9 @@ def test_clamp():
     raw = ObservationScaler(2, rule="raw", clamp=True)
     assert raw(torch.tensor([0.3, 7.0])).tolist() == [pytest.approx(0.3), 1.0]
     assert ObservationScaler(1, rule="raw", clamp=False)(torch.tensor([7.0])).item() == 7.0
+    wider = ObservationScaler(1, rule="raw", limit=10.0)
+    assert wider(torch.tensor([7.0])).item() == 7.0
+    assert wider(torch.tensor([-70.0])).item() == -10.0
 
 
 def test_any_batch_shape_and_dtype():

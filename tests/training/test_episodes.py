@@ -72,3 +72,20 @@ def test_state_goes_through_a_checkpoint(tmp_path):
     assert torch.equal(other(last)[0], returns)
     assert lengths.tolist() == [4, 3]
     assert returns.tolist() == pytest.approx([1.3, 1.2])
+
+
+def test_only_scored_steps_count():
+    """By hand: a failure after 2 of 4 steps, then a whole horizon across two batches."""
+    tracker = EpisodeTracker(1)
+    flags = torch.tensor([[False, False, False, True, False, False]])
+    scored = torch.tensor([[True, True, False, False, True, True]])
+    data = batch(torch.tensor([[1.0, 2.0, 4.0, float("nan"), 16.0, 32.0]]), flags)
+    data["next", "scored"] = scored.unsqueeze(-1)
+    returns, lengths = tracker(data)
+    assert returns.tolist() == [3.0] and lengths.tolist() == [2]
+    data["next", "done"] = torch.tensor([[False, True, False, False, False, False]]).unsqueeze(-1)
+    data["next", "scored"][:] = True
+    data["next", "reward"][0, 3] = 8.0
+    returns, lengths = tracker(data)
+    assert returns.tolist() == [16.0 + 32.0 + 3.0] and lengths.tolist() == [4]
+    assert tracker.running_return.tolist() == [60.0] and tracker.running_length.tolist() == [4]

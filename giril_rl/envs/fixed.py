@@ -1,0 +1,135 @@
+"""Episodes of one length: a failure no longer ends them, so that staying alive pays nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Literal
+
+import gymnasium
+import numpy as np
+import torch
+from tensordict import TensorDictBase
+from torchrl.data import Categorical
+
+from giril_rl.envs.vector import GymVectorEnv
+from giril_rl.errors import UserError
+
+AfterFailure = Literal["reset", "continue"]
+
+
+class FixedHorizonEnv(GymVectorEnv):
+    """A :class:`GymVectorEnv` whose episodes all last until the time limit, which truncates them.
+
+    After a failure the simulator is reset without telling the learner (``after_failure="reset"``,
+    ``done`` stays False), or runs on from where it failed (``"continue"``), which PyBullet's
+    simulators allow: a fallen pendulum hangs and swings.
+
+    ``("next", "observation")`` is the true next state also at a hidden reset, where it is the
+    failed one: the reward of a transition must not see the jump. Two further entries of ``next``
+    tell what follows:
+
+    - ``following_observation``, the state from which the simulator really goes on. It equals
+      ``observation`` but at a hidden reset, where it is the reset observation. A learner's
+      bootstrapped value must be that of this state; :class:`giril_rl.training.PPOLearner` uses it.
+    - ``scored``, whether the step belongs to an episode of the task itself: True up to and with
+      the first failure since the horizon began. The sum of these rewards is the task's own score.
+
+    Step it with :meth:`step_and_maybe_reset`, as collectors and ``rollout`` without a break do:
+    TorchRL's ``step_mdp`` knows nothing of a hidden reset.
+
+    Args:
+        make_fn: as for :class:`GymVectorEnv`.
+        num_envs: number of copies.
+        after_failure: "reset" or "continue".
+        seed: root of the episodes' seeds; each hidden reset begins an episode with its own.
+        max_episode_steps: the horizon; None takes the limit that the environment has.
+
+    Raises:
+        UserError: as :class:`GymVectorEnv`, and where there is no time limit.
+
+    Examples:
+        >>> make = lambda: gymnasium.make("CartPole-v1")
+        >>> env = FixedHorizonEnv(make, num_envs=2, max_episode_steps=100)
+        >>> batch = env.rollout(100, break_when_any_done=False)
+        >>> batch["next", "done"][:, :-1].any().item(), batch["next", "done"][:, -1].all().item()
+        (False, True)
+        >>> jumps = batch["next", "observation"] != batch["next", "following_observation"]
+        >>> jumps.any().item(), batch["next", "terminated"].any().item()
+        (True, False)
+    """
+
+    _onward_key = "following_observation"
+
+    def __init__(
+        self,
+        make_fn: Callable[[], gymnasium.Env],
+        num_envs: int,
+        *,
+        after_failure: AfterFailure = "reset",
+        seed: int = 0,
+        max_episode_steps: int | None = None,
+    ) -> None:
+        super().__init__(make_fn, num_envs, seed=seed, max_episode_steps=max_episode_steps)
+        if self._limit is None:
+            raise UserError(
+                "an environment without a time limit has no fixed horizon: "
+                "set task.max_episode_steps."
+            )
+        self._resets = after_failure == "reset"
+        self._played = np.zeros(num_envs, dtype=np.int64)
+        self._failed = np.zeros(num_envs, dtype=bool)
+
+    def _make_specs(self, env: gymnasium.Env) -> None:
+        super()._make_specs(env)
+        shape = (self.batch_size[0], 1)
+        self.observation_spec["following_observation"] = self.observation_spec[
+            "observation"
+        ].clone()
+        self.observation_spec["scored"] = Categorical(2, shape=shape, dtype=torch.bool)
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        after = super()._step(tensordict)
+        self._played += 1
+        scored = torch.from_numpy(~self._failed).unsqueeze(-1)
+        failed = after.get("terminated").view(-1).numpy()
+        self._failed |= failed
+        following = after.get("observation")
+        if self._resets and failed.any():
+            following = torch.from_numpy(self._restart(failed))
+        after.set("following_observation", following)
+        after.set("scored", scored)
+        after.set("terminated", self._false.clone())
+        after.set("done", after.get("truncated").clone())
+        return after
+
+    def _root(self, observation: torch.Tensor) -> TensorDictBase:
+        root = super()._root(observation)
+        root.set("following_observation", observation)
+        root.set("scored", torch.from_numpy(~self._failed).unsqueeze(-1))
+        return root
+
+    def _reset_where(self, mask: np.ndarray) -> np.ndarray:
+        self._failed[mask] = False
+        return super()._reset_where(mask)
+
+    def _restart(self, mask: np.ndarray) -> np.ndarray:
+        self._played[mask] = 0
+        return super()._restart(mask)
+
+    def _replayed(self) -> np.ndarray:
+        return self._played
+
+    def simulator_state(self) -> dict[str, Any]:
+        """As :meth:`GymVectorEnv.simulator_state`, with what a hidden reset leaves to know.
+
+        The actions are those since the last reset of a simulator, hidden ones included.
+        """
+        return {
+            **super().simulator_state(),
+            "played": torch.from_numpy(self._played.copy()),
+            "failed": torch.from_numpy(self._failed.copy()),
+        }
+
+    def _restore_clocks(self, state: dict[str, Any]) -> None:
+        self._played = state["played"].numpy().copy()
+        self._failed = state["failed"].numpy().copy()

@@ -1,0 +1,68 @@
+"""A control that learns nothing: the error of foreseeing that nothing changes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase, dispatch
+from tensordict.utils import NestedKey
+
+from giril_rl.errors import UserError
+from giril_rl.rewards.generative import reconstruction_error
+from giril_rl.rewards.scaler import ObservationScaler
+
+
+class CopyReward(TensorDictModuleBase):
+    """Eq. 2 with the copy predictor ``s_hat = s``: ``r = lambda * ||s - s'||^2``.
+
+    It pays for how far the scaled (and clamped) state moves in a step. A generative model that has
+    learned little more than that states change slowly pays much the same.
+
+    Reads observation ``(*batch, d)`` and next observation, writes one reward per transition,
+    ``(*batch, 1)``. Only the scaler has to be fitted.
+
+    Args:
+        scaler: applied to both observations.
+        scale: lambda.
+        in_keys: keys of observation and next observation.
+        out_keys: where the reward is written, one key.
+
+    Raises:
+        UserError: for another number of keys.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> s, following = torch.tensor([[0.0, 1.0]]), torch.tensor([[0.5, 3.0]])
+        >>> batch = TensorDict({"observation": s, "next": {"observation": following}}, [1])
+        >>> reward = CopyReward(ObservationScaler(2, rule="raw", clamp=False))
+        >>> reward(batch)["next", "intrinsic_reward"].tolist()
+        [[4.25]]
+    """
+
+    def __init__(
+        self,
+        scaler: ObservationScaler,
+        *,
+        scale: float = 1.0,
+        in_keys: Sequence[NestedKey] = ("observation", ("next", "observation")),
+        out_keys: Sequence[NestedKey] = (("next", "intrinsic_reward"),),
+    ) -> None:
+        super().__init__()
+        if len(in_keys) != 2 or len(out_keys) != 1:
+            raise UserError(
+                "a copy reward has two in_keys (observation, next observation) and one out_key, "
+                f"not {list(in_keys)} and {list(out_keys)}."
+            )
+        self.in_keys: list[NestedKey] = list(in_keys)
+        self.out_keys: list[NestedKey] = list(out_keys)
+        self.scaler = scaler
+        self.scale = scale
+
+    @dispatch(auto_batch_size=False)
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes each transition's reward."""
+        observation, following = (self.scaler(tensordict.get(key)) for key in self.in_keys)
+        reward = self.scale * reconstruction_error(observation, following)
+        return tensordict.set(self.out_keys[0], reward.unsqueeze(-1))

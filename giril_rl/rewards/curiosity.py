@@ -1,0 +1,169 @@
+"""CDIL's reward: the intrinsic curiosity module (ICM) fitted to a demonstration."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase, dispatch
+from tensordict.utils import NestedKey
+from torch import Tensor, nn
+from torchrl.data import TensorSpec
+
+from giril_rl.errors import UserError
+from giril_rl.networks.vectors import mlp
+from giril_rl.rewards.actions import ActionEncoder
+from giril_rl.rewards.scaler import ObservationScaler, ScalingRule
+
+IN_KEYS: tuple[NestedKey, ...] = ("observation", "action", ("next", "observation"))
+OUT_KEYS: tuple[NestedKey, ...] = (("next", "intrinsic_reward"),)
+
+
+def feature_error(predicted: Tensor, features: Tensor) -> Tensor:
+    """``||phi_hat(s') - phi(s')||^2``, summed over the last dimension (paper, appendix on CDIL).
+
+    It is the forward model's loss and, times lambda, the reward; there is no factor of a half.
+
+    Args:
+        predicted: the forward model's ``phi_hat(s')``, ``(*batch, features)``.
+        features: ``phi(s')``, of the same shape.
+
+    Examples:
+        >>> feature_error(torch.tensor([[0.5, 1.0]]), torch.tensor([[0.5, -1.0]]))
+        tensor([4.])
+    """
+    return (predicted - features).square().sum(-1)
+
+
+class CuriosityReward(TensorDictModuleBase):
+    """ICM: ``r = lambda * ||forward(phi(s), a) - phi(s')||^2``, the error in feature space.
+
+    Features are those of observations after the scaler. The inverse model, which reads the action
+    back from ``phi(s)`` and ``phi(s')``, takes no part in the reward: it is what the features are
+    learned by. The reward is deterministic.
+
+    Reads observation ``(*batch, d)``, action and next observation, writes one reward per
+    transition, ``(*batch, 1)``, without averaging. Train it with
+    :class:`~giril_rl.rewards.CuriosityRewardLoss`, after ``reward.scaler.fit(observations)``.
+
+    Args:
+        features: phi, maps a scaled observation to its features.
+        inverse_model: maps ``cat(phi(s), phi(s'))`` to logits of the action or to its code.
+        forward_model: maps ``cat(phi(s), action code)`` to the predicted ``phi(s')``.
+        scaler: applied to both observations.
+        actions: turns actions into codes.
+        scale: lambda.
+        in_keys: keys of observation, action and next observation.
+        out_keys: where the reward is written, one key.
+
+    Raises:
+        UserError: for another number of keys.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> from torchrl.data import Bounded
+        >>> reward = CuriosityReward.for_vectors(2, Bounded(-1, 1, shape=(1,)), normalise="raw")
+        >>> s, a = torch.zeros(4, 2), torch.zeros(4, 1)
+        >>> batch = TensorDict({"observation": s, "action": a, "next": {"observation": s}}, [4])
+        >>> reward(batch)["next", "intrinsic_reward"].shape
+        torch.Size([4, 1])
+    """
+
+    def __init__(
+        self,
+        features: nn.Module,
+        inverse_model: nn.Module,
+        forward_model: nn.Module,
+        *,
+        scaler: ObservationScaler,
+        actions: ActionEncoder,
+        scale: float = 1.0,
+        in_keys: Sequence[NestedKey] = IN_KEYS,
+        out_keys: Sequence[NestedKey] = OUT_KEYS,
+    ) -> None:
+        super().__init__()
+        if len(in_keys) != 3 or len(out_keys) != 1:
+            raise UserError(
+                "a curiosity reward has three in_keys (observation, action, next observation) "
+                f"and one out_key, not {list(in_keys)} and {list(out_keys)}."
+            )
+        self.in_keys: list[NestedKey] = list(in_keys)
+        self.out_keys: list[NestedKey] = list(out_keys)
+        self.features = features
+        self.inverse_model = inverse_model
+        self.forward_model = forward_model
+        self.scaler = scaler
+        self.actions = actions
+        self.scale = scale
+
+    @classmethod
+    def for_vectors(
+        cls,
+        observation_dim: int,
+        action_spec: TensorSpec,
+        *,
+        hidden: Sequence[int] = (100, 100),
+        model_hidden: Sequence[int] = (100,),
+        scale: float = 1.0,
+        normalise: ScalingRule = "standardise",
+        clamp: bool = True,
+        seed: int = 0,
+        in_keys: Sequence[NestedKey] = IN_KEYS,
+        out_keys: Sequence[NestedKey] = OUT_KEYS,
+    ) -> CuriosityReward:
+        """The paper's bodies for vector observations, initialised from ``seed`` alone.
+
+        Args:
+            observation_dim: size of the observation.
+            action_spec: the environment's action spec.
+            hidden: layers of phi, each with tanh after it, so that features lie in (-1, 1); with
+                none, the features are the scaled observation itself.
+            model_hidden: hidden layers (tanh) of the inverse and the forward model.
+            scale: lambda.
+            normalise: the scaler's rule.
+            clamp: clamp the scaled observations to [-1, 1].
+            seed: seed of the weights. The global random state is neither read nor changed.
+            in_keys: keys of observation, action and next observation.
+            out_keys: where the reward is written, one key.
+
+        Raises:
+            UserError: for an unknown rule or kind of action.
+        """
+        actions = ActionEncoder(action_spec)
+        size = hidden[-1] if hidden else observation_dim
+        with torch.random.fork_rng(devices=[]):
+            torch.default_generator.manual_seed(seed)
+            features: nn.Module = nn.Identity()
+            if hidden:
+                features = nn.Sequential(*mlp(observation_dim, size, hidden[:-1]), nn.Tanh())
+            inverse_model = mlp(2 * size, actions.size, model_hidden)
+            forward_model = mlp(size + actions.size, size, model_hidden)
+        return cls(
+            features,
+            inverse_model,
+            forward_model,
+            scaler=ObservationScaler(observation_dim, rule=normalise, clamp=clamp),
+            actions=actions,
+            scale=scale,
+            in_keys=in_keys,
+            out_keys=out_keys,
+        )
+
+    def invert(self, features: Tensor, next_features: Tensor) -> Tensor:
+        """``a_hat``: logits of a discrete action, the code of a continuous one."""
+        return self.inverse_model(torch.cat((features, next_features), -1))
+
+    def predict(self, features: Tensor, action_code: Tensor) -> Tensor:
+        """``phi_hat(s')`` from ``phi(s)`` and the action's code."""
+        return self.forward_model(torch.cat((features, action_code), -1))
+
+    @dispatch(auto_batch_size=False)
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes each transition's reward."""
+        observation, action, following = (tensordict.get(key) for key in self.in_keys)
+        features = self.features(self.scaler(observation))
+        next_features = self.features(self.scaler(following))
+        predicted = self.predict(features, self.actions(action))
+        reward = self.scale * feature_error(predicted, next_features)
+        return tensordict.set(self.out_keys[0], reward.unsqueeze(-1))

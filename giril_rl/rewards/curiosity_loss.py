@@ -1,0 +1,130 @@
+"""Training CDIL's reward model: the intrinsic curiosity module's objective on a demonstration."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import dispatch
+from tensordict.utils import NestedKey
+from torch import Tensor
+from torchrl.objectives import LossModule
+
+from giril_rl.errors import UserError
+from giril_rl.rewards.curiosity import CuriosityReward, feature_error
+from giril_rl.rewards.generative_loss import Reduction, action_term
+
+FeatureTraining = Literal["inverse", "both", "none"]
+
+
+class CuriosityRewardLoss(LossModule):
+    """``L_I + L_F`` of the paper's appendix on CDIL, to be minimised.
+
+    - ``loss_inverse``: how far the action that the inverse model reads from ``phi(s)`` and
+      ``phi(s')`` is from the expert's, by :func:`~giril_rl.rewards.action_term`: cross-entropy for
+      discrete actions, mean squared error for continuous ones.
+    - ``loss_forward``: :func:`~giril_rl.rewards.curiosity.feature_error` of the forward model.
+
+    Inverse and forward model are always trained. The paper does not say which loss trains phi:
+
+    - ``"inverse"``: ``L_I`` alone, as features are "learned with a self-supervised inverse
+      dynamics model". ``L_F`` sees phi as fixed and has ``theta_F`` only.
+    - ``"both"``: the sum's gradient, if phi counts as part of ``theta_I`` in the joint objective.
+      ``L_F`` then pulls the features together, since shrunken ones are easily predicted.
+    - ``"none"``: phi keeps its random weights, as in the authors' released code.
+
+    Args:
+        reward: the module to train; its parameters are this loss's parameters.
+        features: what trains phi.
+        reduction: ``"mean"``, ``"sum"`` or ``"none"`` over transitions.
+
+    Raises:
+        UserError: for an unknown ``features`` or ``reduction``.
+
+    Examples:
+        >>> from torchrl.data import Bounded
+        >>> reward = CuriosityReward.for_vectors(2, Bounded(-1, 1, shape=(1,)), normalise="raw")
+        >>> loss = CuriosityRewardLoss(reward)
+        >>> s, a = torch.zeros(4, 2), torch.zeros(4, 1)
+        >>> batch = TensorDict({"observation": s, "action": a, "next": {"observation": s}}, [4])
+        >>> sorted(loss(batch).keys())
+        ['loss_forward', 'loss_inverse']
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        """The keys that :meth:`set_keys` changes; their defaults are the reward's ``in_keys``.
+
+        Attributes:
+            observation: observation ``(*batch, d)``.
+            action: action, as the environment takes it.
+            next_observation: the true next observation.
+        """
+
+        observation: NestedKey = "observation"
+        action: NestedKey = "action"
+        next_observation: NestedKey = ("next", "observation")
+
+    default_keys = _AcceptedKeys
+    tensor_keys: _AcceptedKeys
+    reward: CuriosityReward
+
+    def __init__(
+        self,
+        reward: CuriosityReward,
+        *,
+        features: FeatureTraining = "inverse",
+        reduction: Reduction = "mean",
+    ) -> None:
+        super().__init__()
+        if features not in get_args(FeatureTraining):
+            raise UserError(f"features={features!r} is unknown: choose inverse, both or none.")
+        if reduction not in get_args(Reduction):
+            raise UserError(f"reduction={reduction!r} is unknown: choose mean, sum or none.")
+        self.reward = reward
+        self.features: FeatureTraining = features
+        self.reduction = reduction
+        observation, action, following = reward.in_keys
+        self.set_keys(observation=observation, action=action, next_observation=following)
+
+    def _forward_value_estimator_keys(self, **kwargs: NestedKey) -> None:
+        pass
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        """Keys of observation, action and next observation."""
+        keys = self.tensor_keys
+        return [keys.observation, keys.action, keys.next_observation]
+
+    @property
+    def out_keys(self) -> list[NestedKey]:
+        """Names of the two terms."""
+        return ["loss_inverse", "loss_forward"]
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """The two terms, reduced; with ``reduction="none"`` of the batch's shape."""
+        observation, action, following = (tensordict.get(key) for key in self.in_keys)
+        terms = self._terms(observation, action, following)
+        reduced = {
+            name: self._reduce_loss(term, tensordict=tensordict)
+            for name, term in zip(self.out_keys, terms, strict=True)
+        }
+        batch_size = tensordict.batch_size if self.reduction == "none" else []
+        return TensorDict._new_unsafe(reduced, torch.Size(batch_size))
+
+    def _terms(
+        self, observation: Tensor, action: Tensor, following: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        reward = self.reward
+        phi = reward.features(reward.scaler(observation))
+        next_phi = reward.features(reward.scaler(following))
+        if self.features == "none":
+            phi, next_phi = phi.detach(), next_phi.detach()
+        inverse = action_term(reward.invert(phi, next_phi), reward.actions.target(action))
+        if self.features == "inverse":
+            phi, next_phi = phi.detach(), next_phi.detach()
+        error = feature_error(reward.predict(phi, reward.actions(action)), next_phi)
+        return inverse, error

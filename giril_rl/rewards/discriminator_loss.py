@@ -1,0 +1,130 @@
+"""Training a discriminator to tell the expert's pairs from the policy's."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import dispatch
+from tensordict.utils import NestedKey
+from torch import Tensor
+from torchrl.objectives import LossModule
+
+from giril_rl.errors import UserError
+from giril_rl.rewards.adversarial import discriminator_loss, gradient_penalty, interpolated
+from giril_rl.rewards.discriminator import DiscriminatorReward
+
+
+class DiscriminatorLoss(LossModule):
+    """GAIL's binary cross-entropy on logits, with an optional gradient penalty.
+
+    - ``loss_expert``: mean of ``-log D`` over the expert's pairs.
+    - ``loss_policy``: mean of ``-log(1 - D)`` over the policy's.
+    - ``loss_penalty``, where the weight is not 0: see
+      :func:`~giril_rl.rewards.adversarial.gradient_penalty`, of the logit, at points between scaled
+      observations and between action codes of the two sets, so that discrete actions do too. One
+      uniform weight per pair, from the global generator.
+
+    Their sum is to be minimised. ``accuracy_expert`` and ``accuracy_policy`` are logged besides.
+
+    The two sets lie beside each other, usually under ``"expert"`` and ``"policy"``; each is flat,
+    ``(n, ...)``. Their sizes may differ; the TensorDict that holds both then has no batch
+    dimension. Without penalty and for equal sizes the loss is that of TorchRL's ``GAILLoss``, which
+    wants probabilities.
+
+    Args:
+        reward: the module to train; its parameters are this loss's parameters.
+        penalty: weight of the gradient penalty; 0 leaves it out.
+
+    Raises:
+        UserError: for a negative penalty.
+
+    Examples:
+        >>> from torchrl.data import Categorical
+        >>> reward = DiscriminatorReward.for_vectors(2, Categorical(3), normalise="raw")
+        >>> pairs = lambda n: {"observation": torch.zeros(n, 2), "action": torch.zeros(n)}
+        >>> batch = TensorDict({"expert": pairs(50), "policy": pairs(256)})
+        >>> sorted(DiscriminatorLoss(reward, penalty=10.0)(batch).keys())
+        ['accuracy_expert', 'accuracy_policy', 'loss_expert', 'loss_penalty', 'loss_policy']
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        """The keys that :meth:`set_keys` changes; their defaults follow the reward's ``in_keys``.
+
+        Attributes:
+            expert_observation: raw observations of the expert ``(n, d)``.
+            expert_action: its actions, as the environment takes them.
+            policy_observation: raw observations of the policy ``(m, d)``.
+            policy_action: its actions.
+        """
+
+        expert_observation: NestedKey = ("expert", "observation")
+        expert_action: NestedKey = ("expert", "action")
+        policy_observation: NestedKey = ("policy", "observation")
+        policy_action: NestedKey = ("policy", "action")
+
+    default_keys = _AcceptedKeys
+    tensor_keys: _AcceptedKeys
+    reward: DiscriminatorReward
+
+    def __init__(self, reward: DiscriminatorReward, *, penalty: float = 0.0) -> None:
+        super().__init__()
+        if not penalty >= 0:
+            raise UserError(f"penalty={penalty} is negative: give a weight of 0 or more.")
+        self.reward = reward
+        self.penalty = penalty
+        observation, action = (k if isinstance(k, tuple) else (k,) for k in reward.in_keys)
+        self.set_keys(
+            expert_observation=("expert", *observation),
+            expert_action=("expert", *action),
+            policy_observation=("policy", *observation),
+            policy_action=("policy", *action),
+        )
+
+    def _forward_value_estimator_keys(self, **kwargs: NestedKey) -> None:
+        pass
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        """Keys of the expert's observation and action and of the policy's."""
+        keys = self.tensor_keys
+        expert = [keys.expert_observation, keys.expert_action]
+        return [*expert, keys.policy_observation, keys.policy_action]
+
+    @property
+    def out_keys(self) -> list[NestedKey]:
+        """Names of the terms to be added, ``loss_*``, and of what is logged."""
+        penalty = ["loss_penalty"] if self.penalty else []
+        return ["loss_expert", "loss_policy", *penalty, *self.log_keys]
+
+    @property
+    def log_keys(self) -> list[str]:
+        """Names of what is logged."""
+        return ["accuracy_expert", "accuracy_policy"]
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """The terms and what is logged, all scalars."""
+        entries = [tensordict.get(key) for key in self.in_keys]
+        expert = self.reward.inputs(*entries[:2])
+        policy = self.reward.inputs(*entries[2:])
+        # One pass for both sets.
+        observation, code = (torch.cat(sets) for sets in zip(expert, policy, strict=True))
+        logit, out = self._judge(observation, code, len(expert[0]))
+        logits = logit[: len(expert[0])], logit[len(expert[0]) :]
+        out["loss_expert"], out["loss_policy"] = discriminator_loss(*logits)
+        if self.penalty:
+            weight = torch.rand(max(len(expert[0]), len(policy[0])), device=logit.device)
+            points = [interpolated(e, p, weight) for e, p in zip(expert, policy, strict=True)]
+            out["loss_penalty"] = self.penalty * gradient_penalty(self.reward.logit, points)
+        out["accuracy_expert"] = (logits[0] > 0).to(logit.dtype).mean()
+        out["accuracy_policy"] = (logits[1] < 0).to(logit.dtype).mean()
+        return TensorDict({str(key): out[str(key)] for key in self.out_keys})
+
+    def _judge(
+        self, observation: Tensor, code: Tensor, experts: int
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """The logits of both sets, of which the first ``experts`` are the expert's."""
+        return self.reward.logit(observation, code), {}

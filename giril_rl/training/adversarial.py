@@ -1,0 +1,106 @@
+"""Training a discriminator beside the policy: a few steps with every batch of PPO."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+
+from giril_rl.configs import AdversarialConfig
+from giril_rl.rewards.bottleneck_loss import BottleneckLoss
+from giril_rl.rewards.discriminator_loss import DiscriminatorLoss
+from giril_rl.training.traced import TracedGradients
+
+
+class AdversarialLearner:
+    """The :class:`~giril_rl.training.ppo.RewardLearner` of GAIL and VAIL.
+
+    Args:
+        loss: the discriminator's loss, of which it trains the reward module in place.
+        expert: the expert's pairs, a flat batch with the reward's ``in_keys``.
+        cfg: step size, number of steps with each batch, and their size.
+        seed: seeds minibatches and the loss's noise; the global random state is left alone.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> from torchrl.data import Bounded
+        >>> from giril_rl.rewards import DiscriminatorReward
+        >>> reward = DiscriminatorReward.for_vectors(
+        ...     2, Bounded(-1, 1, shape=(1,)), normalise="raw"
+        ... )
+        >>> pairs = lambda *n: TensorDict(
+        ...     {"observation": torch.randn(*n, 2), "action": torch.zeros(*n, 1)}, n
+        ... )
+        >>> learner = AdversarialLearner(
+        ...     DiscriminatorLoss(reward), pairs(50), AdversarialConfig(), seed=0
+        ... )
+        >>> metrics = learner.update(pairs(4, 100))  # 4 environments, 100 steps
+        >>> sorted(metrics)[:2]
+        ['discriminator/accuracy_expert', 'discriminator/accuracy_policy']
+    """
+
+    def __init__(
+        self, loss: DiscriminatorLoss, expert: TensorDictBase, cfg: AdversarialConfig, *, seed: int
+    ) -> None:
+        self.loss = loss
+        self.cfg = cfg
+        self._pair_keys = loss.reward.in_keys
+        self._expert = [expert.get(key).contiguous() for key in self._pair_keys]
+        self.gradients = TracedGradients(loss, keys=loss.in_keys, log=loss.log_keys)
+        self.optimizer = torch.optim.Adam(self.gradients.parameters, lr=cfg.lr, fused=True)
+        self._rng = torch.Generator().manual_seed(seed).get_state()
+
+    def update(self, batch: TensorDictBase) -> dict[str, float]:
+        """Trains the discriminator on a batch ``(num_envs, time)`` of which it reads the pairs.
+
+        Returns:
+            Means over the steps of all losses and of what the loss logs, and VAIL's beta.
+        """
+        dims = batch.ndim
+        policy = [batch.get(key).flatten(0, dims - 1) for key in self._pair_keys]
+        self.loss.reward.observe(policy[0])
+        with torch.random.fork_rng(devices=[]):
+            torch.set_rng_state(self._rng)
+            logs = [self._step(policy) for _ in range(self.cfg.updates)]
+            self._rng = torch.get_rng_state()
+        metrics = {
+            f"discriminator/{name}": torch.stack([log[name] for log in logs]).mean().item()
+            for name in logs[0]
+        }
+        if isinstance(self.loss, BottleneckLoss):
+            metrics["discriminator/beta"] = self.loss.beta.item()
+        return metrics
+
+    def _step(self, policy: list[Tensor]) -> dict[str, Tensor]:
+        log = self.gradients.step(
+            [*_drawn(self._expert, self.cfg.batch), *_drawn(policy, self.cfg.batch)]
+        )
+        self.optimizer.step()
+        if isinstance(self.loss, BottleneckLoss):
+            self.loss.update_beta(log["kl"])
+        return log
+
+    def state_dict(self) -> dict[str, Any]:
+        """All that later updates depend on, the reward module included."""
+        return {
+            "loss": dict(self.loss.state_dict()),
+            "optimizer": self.optimizer.state_dict(),
+            "rng": self._rng,
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restores what :meth:`state_dict` gave."""
+        self.loss.load_state_dict(state["loss"])
+        self.optimizer.load_state_dict(state["optimizer"])
+        self._rng = state["rng"]
+
+
+def _drawn(columns: list[Tensor], size: int) -> list[Tensor]:
+    """``size`` rows without repetition, or all of them where there are no more."""
+    rows = len(columns[0])
+    if rows <= size:
+        return columns
+    index = torch.randperm(rows)[:size]
+    return [column[index] for column in columns]

@@ -1,0 +1,134 @@
+"""The rewards that stand in for a learned one, made as the learned ones are."""
+
+from __future__ import annotations
+
+from typing import cast
+
+import torch
+from tensordict.nn import TensorDictModuleBase
+
+from giril_rl.configs import ControlRunConfig, CuriosityConfig, GenerativeConfig
+from giril_rl.demos import Demonstration, holdout, subsample
+from giril_rl.envs import GymVectorEnv
+from giril_rl.rewards import (
+    AffineReward,
+    ConstantReward,
+    CopyReward,
+    CuriosityReward,
+    GenerativeReward,
+    GenerativeRewardLoss,
+    NoiseReward,
+    ObservationScaler,
+    Prior,
+    ScalingRule,
+)
+from giril_rl.training.fit import fit_reward
+from giril_rl.training.run import Run
+
+
+def control_reward(
+    cfg: ControlRunConfig, env: GymVectorEnv, demo: Demonstration | None, run: Run
+) -> tuple[TensorDictModuleBase, dict[str, int]]:
+    """The reward module that ``cfg.reward`` names, and the seeds that it depends on.
+
+    Args:
+        cfg: the run's settings; ``cfg.giril`` and ``cfg.icm`` mean what they do in their recipes.
+        env: the environment, for its specs.
+        demo: the demonstration; None for ``constant``.
+        run: where a fit's metrics and checkpoints go, and the moments that were matched.
+
+    Raises:
+        UserError: if the fitted reward is the same for all transitions and noise should match it.
+    """
+    if demo is None:
+        return ConstantReward(), {}
+    seeds = {"expert": cfg.expert.seed, "demo": cfg.demo.seed}
+    if cfg.reward == "copy":
+        return _copy(cfg.giril, env, demo), seeds
+    part = cfg.icm if cfg.reward == "untrained_icm" else cfg.giril
+    seed = cfg.seed if part.seed is None else part.seed
+    seeds = {"reward": seed, **seeds}
+    if cfg.reward == "untrained_icm":
+        return _curiosity(cfg.icm, env, demo, seed), seeds
+    reward = _generative(cfg.giril, env, demo, seed)
+    if cfg.reward == "untrained_giril":
+        return reward, seeds
+    fit_reward(
+        GenerativeRewardLoss(reward, alpha=cfg.giril.alpha),
+        subsample(demo, cfg.demo.subsample),
+        cfg.fit,
+        seed=seed,
+        run=run,
+        held_out=holdout(demo, cfg.demo.subsample),
+    )
+    if cfg.reward == "negated_giril":
+        return AffineReward(reward, scale=-1.0), seeds
+    mean, variance = moments(reward, demo)
+    run.truncate_metrics("moments", -1)
+    run.log(0, {"moments/mean": mean, "moments/variance": variance}, phase="moments")
+    if cfg.reward == "centred_giril":
+        return AffineReward(reward, shift=-mean), seeds
+    return NoiseReward(mean, variance, seed=seed), seeds
+
+
+@torch.no_grad()
+def moments(reward: TensorDictModuleBase, demo: Demonstration) -> tuple[float, float]:
+    """Mean and (population) variance of a reward over all transitions of a demonstration.
+
+    Args:
+        reward: a module that writes one key, one value per transition.
+        demo: the demonstration, which is left as it is.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> demo = Demonstration(TensorDict({"observation": torch.zeros(4, 2)}, [4]))
+        >>> moments(ConstantReward(3.0), demo)
+        (3.0, 0.0)
+    """
+    view = demo.transitions.select(*reward.in_keys)
+    values = reward(view).get(reward.out_keys[0]).double()
+    return values.mean().item(), values.var(correction=0).item()
+
+
+def _size(env: GymVectorEnv) -> int:
+    return env.observation_spec["observation"].shape[-1]
+
+
+def _copy(cfg: GenerativeConfig, env: GymVectorEnv, demo: Demonstration) -> CopyReward:
+    scaler = ObservationScaler(_size(env), rule=cast(ScalingRule, cfg.normalise), clamp=cfg.clamp)
+    return CopyReward(scaler.fit(demo.transitions["observation"]), scale=cfg.scale)
+
+
+def _generative(
+    cfg: GenerativeConfig, env: GymVectorEnv, demo: Demonstration, seed: int
+) -> GenerativeReward:
+    reward = GenerativeReward.for_vectors(
+        _size(env),
+        env.action_spec,
+        hidden=cfg.hidden,
+        beta=cfg.beta,
+        scale=cfg.scale,
+        prior=cast(Prior, cfg.prior),
+        normalise=cast(ScalingRule, cfg.normalise),
+        clamp=cfg.clamp,
+        seed=seed,
+    )
+    reward.scaler.fit(demo.transitions["observation"])
+    return reward
+
+
+def _curiosity(
+    cfg: CuriosityConfig, env: GymVectorEnv, demo: Demonstration, seed: int
+) -> CuriosityReward:
+    reward = CuriosityReward.for_vectors(
+        _size(env),
+        env.action_spec,
+        hidden=cfg.hidden,
+        model_hidden=cfg.model_hidden,
+        scale=cfg.scale,
+        normalise=cast(ScalingRule, cfg.normalise),
+        clamp=cfg.clamp,
+        seed=seed,
+    )
+    reward.scaler.fit(demo.transitions["observation"])
+    return reward

@@ -1,0 +1,60 @@
+"""The policy that a score of nothing learned comes from."""
+
+from __future__ import annotations
+
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torchrl.data import TensorSpec, Unbounded
+
+from giril_rl.configs import TaskConfig
+from giril_rl.envs import make_env
+from giril_rl.errors import UserError
+
+RANDOM = "control:random"
+"""The method's name in ``result.json``; such a run holds no policy."""
+
+
+class RandomPolicy(TensorDictModuleBase):
+    """Draws actions uniformly from the action space, with torch's global generator.
+
+    Args:
+        action_spec: the spec of a batched environment, whose first dimension is dropped.
+
+    Raises:
+        UserError: for actions without bounds, which have no uniform distribution.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl.data import Bounded
+        >>> policy = RandomPolicy(Bounded(-2.0, 2.0, shape=(16, 1)))
+        >>> action = policy(TensorDict(batch_size=[5]))["action"]
+        >>> action.shape, bool(action.abs().max() <= 2)
+        (torch.Size([5, 1]), True)
+    """
+
+    def __init__(self, action_spec: TensorSpec) -> None:
+        super().__init__()
+        if isinstance(action_spec, Unbounded):
+            raise UserError(
+                "actions without bounds have no uniform distribution: choose a task with bounded "
+                "actions for the random policy."
+            )
+        self.in_keys: list[str] = []
+        self.out_keys = ["action"]
+        self.spec = action_spec[0]
+
+    @classmethod
+    def of_task(cls, task: TaskConfig) -> RandomPolicy:
+        """The random policy of a task's action space."""
+        env = make_env(task, 1, seed=0)
+        env.close()
+        return cls(env.action_spec)
+
+    def acting(self) -> RandomPolicy:
+        """Itself: what an agent's method of this name gives to an environment."""
+        return self
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes an action for each element of the batch."""
+        return tensordict.set("action", self.spec.rand(tensordict.batch_size))

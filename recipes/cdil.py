@@ -1,0 +1,104 @@
+"""CDIL: a reward from a curiosity module of the demonstration, and a policy that maximises it.
+
+Expert -> demonstration -> ICM -> error in feature space -> PPO -> score on the true reward.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import cast
+
+from torchrl.envs import Compose
+
+from giril_rl.configs import (
+    CuriosityConfig,
+    DemoConfig,
+    ExpertConfig,
+    FitConfig,
+    RunConfig,
+    ScalingConfig,
+)
+from giril_rl.demos import holdout, subsample
+from giril_rl.envs import make_env
+from giril_rl.rewards import CuriosityReward, CuriosityRewardLoss, FeatureTraining, ScalingRule
+from giril_rl.training import (
+    Run,
+    check_inputs,
+    finish_run,
+    fit_reward,
+    make_agent,
+    obtain_demonstration,
+    return_scaling,
+    train_ppo,
+)
+from giril_rl.transforms import BatchMeanReward, IntrinsicReward
+
+
+@dataclass
+class Config(RunConfig):
+    """What `giril run cdil` takes."""
+
+    expert: ExpertConfig = field(default_factory=ExpertConfig)
+    demo: DemoConfig = field(default_factory=DemoConfig)
+    reward: CuriosityConfig = field(default_factory=CuriosityConfig)
+    fit: FitConfig = field(default_factory=FitConfig)
+    scaling: ScalingConfig = field(default_factory=ScalingConfig)
+
+
+def main(cfg: Config, out: Path) -> None:
+    """Train the whole chain and leave its run folder in ``out``."""
+    check_inputs(cfg, cfg.expert, cfg.demo)
+    with Run.open(out, asdict(cfg), recipe="cdil", logger=cfg.logger) as run:
+        if run.finished:
+            return
+        demo, expert = obtain_demonstration(cfg, cfg.expert, cfg.demo)
+        env = make_env(cfg.task, cfg.ppo.num_envs, cfg.seed)
+
+        reward_seed = cfg.seed if cfg.reward.seed is None else cfg.reward.seed
+        reward = CuriosityReward.for_vectors(
+            env.observation_spec["observation"].shape[-1],
+            env.action_spec,
+            hidden=cfg.reward.hidden,
+            model_hidden=cfg.reward.model_hidden,
+            scale=cfg.reward.scale,
+            normalise=cast(ScalingRule, cfg.reward.normalise),
+            clamp=cfg.reward.clamp,
+            seed=reward_seed,
+        )
+        reward.scaler.fit(demo.transitions["observation"])
+        fit_reward(
+            CuriosityRewardLoss(reward, features=cast(FeatureTraining, cfg.reward.features)),
+            subsample(demo, cfg.demo.subsample),
+            cfg.fit,
+            seed=reward_seed,
+            run=run,
+            held_out=holdout(demo, cfg.demo.subsample),
+        )
+
+        relabel = Compose(
+            IntrinsicReward(reward),
+            *([BatchMeanReward()] if cfg.batch_mean else []),
+            *return_scaling(cfg.scaling, cfg.ppo.gamma),
+        )
+        agent = make_agent(env, cfg.ppo, cfg.seed)
+        trained = train_ppo(
+            env,
+            agent,
+            relabel,
+            cfg.ppo,
+            steps=cfg.steps,
+            seed=cfg.seed,
+            run=run,
+            termination=cfg.termination,
+        )
+        finish_run(
+            run,
+            cfg,
+            agent,
+            trained,
+            method="cdil",
+            expert=expert,
+            demo=demo,
+            seeds={"reward": reward_seed, "expert": cfg.expert.seed, "demo": cfg.demo.seed},
+        )
