@@ -117,7 +117,7 @@ def _run_all(run: Callable[[Path], None], titles: Mapping[Path, str]) -> int:
         try:
             run(out)
         except Exception as error:
-            failed[title] = _report(error, show_traceback=False)
+            failed[title] = _refuse(error, show_traceback=False)
     if failed:
         print(f"giril: {len(failed)} of {len(titles)} jobs failed:", file=sys.stderr)
         for title in failed:
@@ -144,11 +144,48 @@ def _eval(argv: Sequence[str]) -> int:
     return 0
 
 
+def _study(argv: Sequence[str]) -> int:
+    """Make the runs of a study, several at a time."""
+    parser = _Parser("giril study", description=_study.__doc__, add_help=False)
+    parser.add_argument("words", nargs="*", metavar="STUDY [key=value ...]")
+    parser.add_argument("--dry-run", action="store_true", help="only check and list the runs")
+    parser.add_argument("-h", "--help", action="store_true")
+    args = parser.parse_intermixed_args(argv)
+    if args.help:
+        from giril_rl.study.help import study_help
+
+        print(study_help())
+        return 0
+    if not args.words:
+        raise UserError("name a study: `giril study --help` shows them.")
+    from giril_rl.study.command import run_study
+
+    return run_study(args.words[0], args.words[1:], dry_run=args.dry_run)
+
+
+def _report(argv: Sequence[str]) -> int:
+    """Write tables and curves of all runs below a folder."""
+    parser = _Parser("giril report", description=_report.__doc__)
+    parser.add_argument("runs", metavar="DIR", type=Path, help="the folder that the runs are in")
+    parser.add_argument(
+        "--out", type=Path, metavar="FOLDER", help="where to write; DIR/report if not given"
+    )
+    args = parser.parse_args(argv)
+    if not args.runs.is_dir():
+        raise UserError(f"there is no folder {args.runs}.")
+    from giril_rl.report.report import write_report
+
+    print(write_report(args.runs, args.out or args.runs / "report"))
+    return 0
+
+
 _COMMANDS: dict[str, tuple[Callable[[Sequence[str]], int], str]] = {
     "ls": (_ls, "giril ls"),
     "cp": (_cp, "giril cp RECIPE FILE"),
     "run": (_run, "giril run RECIPE [key=value ...] [-m] [--help]"),
     "eval": (_eval, "giril eval RUN [--episodes N] [--seed S]"),
+    "study": (_study, "giril study STUDY [key=value ...] [--dry-run]"),
+    "report": (_report, "giril report DIR [--out FOLDER]"),
 }
 
 
@@ -159,7 +196,7 @@ def _usage() -> str:
     return "\n".join(["Imitation learning with generated rewards.", "", *rows, "", last])
 
 
-def _report(error: Exception, show_traceback: bool) -> int:
+def _refuse(error: Exception, show_traceback: bool) -> int:
     refused = isinstance(error, UserError)
     if show_traceback or not refused:
         traceback.print_exception(error)
@@ -176,7 +213,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     Examples:
         >>> main(["ls"])
-        control ...
+        bc ...
         0
     """
     words = list(sys.argv[1:] if argv is None else argv)
@@ -198,7 +235,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except Exception as error:
-        return _report(error, show_traceback)
+        return _refuse(error, show_traceback)
 
 
 if __name__ == "__main__":

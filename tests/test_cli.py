@@ -85,6 +85,8 @@ def test_ls_names_every_recipe_with_its_first_line(capsys):
         (["--help"], {"torch", "torchrl", "hydra", "gymnasium"}),
         (["run", "giril", "--help"], {"torch", "torchrl", "gymnasium"}),
         (["run", "giril", "seed=x"], {"torch", "torchrl", "gymnasium"}),
+        (["study", "--help"], {"torch", "torchrl", "hydra", "gymnasium", "ray"}),
+        (["study", "smoke", "seed=x"], {"torch", "torchrl", "gymnasium", "ray"}),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )
@@ -105,7 +107,7 @@ def test_module_runs_as_a_script_and_returns_its_exit_code():
     ("argv", "sentence"),
     [
         (["rnu"], "'rnu' is not a command; did you mean 'run'?"),
-        (["zzz"], "'zzz' is not a command: choose one of ls, cp, run, eval."),
+        (["zzz"], "'zzz' is not a command: choose one of ls, cp, run, eval, study, report."),
         (["run"], "name a recipe: `giril ls` shows them."),
         (["run", "girl"], "'girl' is not a recipe; did you mean 'giril'?"),
         (["run", "none.py"], "there is no file none.py; `giril cp RECIPE none.py` makes one."),
@@ -118,6 +120,12 @@ def test_module_runs_as_a_script_and_returns_its_exit_code():
         (["eval", "nowhere"], "there is no run folder nowhere."),
         (["eval", ".", "--episodes", "0"], "--episodes 0: at least 1 is needed."),
         (["eval", ".", "--seed", "-1"], "--seed -1: at least 0 is needed."),
+        (["study"], "name a study: `giril study --help` shows them."),
+        (["study", "smok"], "'smok' is not a study; did you mean 'smoke'?"),
+        (["study", "no.yaml"], "there is no file no.yaml: write the study there, or name another."),
+        (["study", "smoke", "jobs=0"], "jobs=0 must be at least 1."),
+        (["study", "smoke", "launcher=slurm"], "launcher=slurm: choose one of local, ray."),
+        (["report", "nowhere"], "there is no folder nowhere."),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )

@@ -14,7 +14,7 @@ from torch import Tensor
 from giril_rl.demos.check import check_demonstration
 from giril_rl.demos.demonstration import Demonstration
 from giril_rl.demos.replay import as_executed, as_recorded, verify_by_replay
-from giril_rl.envs.vector import silent_stdout
+from giril_rl.envs.stdout import silent_stdout
 from giril_rl.errors import UserError
 from giril_rl.files import installed_versions
 from giril_rl.progress import progress

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import gymnasium
 import numpy as np
 
-from giril_rl.envs.vector import silent_stdout
+from giril_rl.envs.stdout import silent_stdout
 from giril_rl.errors import UserError
 
 if TYPE_CHECKING:

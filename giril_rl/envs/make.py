@@ -12,7 +12,8 @@ import gymnasium
 
 from giril_rl.configs import TaskConfig
 from giril_rl.envs.fixed import AfterFailure, FixedHorizonEnv
-from giril_rl.envs.vector import GymVectorEnv, silent_stdout
+from giril_rl.envs.stdout import silent_stdout
+from giril_rl.envs.vector import GymVectorEnv
 from giril_rl.errors import UserError
 from giril_rl.nearest import did_you_mean
 

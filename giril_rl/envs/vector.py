@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import contextlib
-import os
-import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import gymnasium
 import numpy as np
 import torch
-from gymnasium.wrappers import OrderEnforcing, PassiveEnvChecker, TimeLimit
 from tensordict import TensorDict, TensorDictBase
-from torchrl.data import Bounded, Categorical, Composite, TensorSpec, Unbounded
+from torchrl.data import Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from giril_rl.envs.spaces import action_spec, without_bookkeeping
+from giril_rl.envs.stdout import silent_stdout
 from giril_rl.errors import UserError
 
 
@@ -95,7 +94,7 @@ class GymVectorEnv(EnvBase):
         self.observation_spec = Composite(
             observation=Unbounded((n, *observation.shape), dtype=torch.float32), shape=(n,)
         )
-        self.action_spec = _action_spec(action, n, name)
+        self.action_spec = action_spec(action, n, name)
         bounded = isinstance(self.action_spec, Bounded)
         self._bounds = (action.low, action.high) if bounded else None  # type: ignore[attr-defined]
         self.reward_spec = Unbounded((n, 1), dtype=torch.float32)
@@ -264,64 +263,3 @@ class GymVectorEnv(EnvBase):
             for env in self._gym_envs:
                 env.close()
         super().close(raise_if_closed=raise_if_closed)
-
-
-def without_bookkeeping(env: gymnasium.Env) -> tuple[gymnasium.Env, int | None]:
-    """Strips Gymnasium's outermost order, space and time checks.
-
-    The batched environment counts steps itself, for all copies at once.
-
-    Returns:
-        The environment below those wrappers, and the time limit in steps if there was one.
-
-    Examples:
-        >>> import gymnasium
-        >>> env, limit = without_bookkeeping(gymnasium.make("CartPole-v1"))
-        >>> type(env).__name__, limit
-        ('CartPoleEnv', 500)
-    """
-    limit = None
-    while isinstance(env, (OrderEnforcing, PassiveEnvChecker, TimeLimit)):
-        if isinstance(env, TimeLimit):
-            limit = env._max_episode_steps
-        env = env.env
-    return env, limit
-
-
-@contextlib.contextmanager
-def silent_stdout(*, stderr: bool = False) -> Iterator[None]:
-    """Drops what C code prints on standard output, as pybullet does whenever it connects.
-
-    Args:
-        stderr: drop what is printed on standard error as well, as pybullet does when imported.
-    """
-    streams = [sys.stdout, sys.stderr] if stderr else [sys.stdout]
-    for stream in streams:
-        stream.flush()
-    saved = [os.dup(descriptor) for descriptor in range(1, len(streams) + 1)]
-    null = os.open(os.devnull, os.O_WRONLY)
-    try:
-        for descriptor in range(1, len(streams) + 1):
-            os.dup2(null, descriptor)
-        yield
-    finally:
-        for descriptor, (stream, kept) in enumerate(zip(streams, saved, strict=True), 1):
-            stream.flush()
-            os.dup2(kept, descriptor)
-            os.close(kept)
-        os.close(null)
-
-
-def _action_spec(space: gymnasium.Space, num_envs: int, name: str) -> TensorSpec:
-    if isinstance(space, gymnasium.spaces.Discrete) and space.start == 0:
-        return Categorical(int(space.n), shape=(num_envs,), dtype=torch.int64)
-    if isinstance(space, gymnasium.spaces.Box) and len(space.shape) == 1:
-        shape = (num_envs, *space.shape)
-        if not (np.isfinite(space.low).all() and np.isfinite(space.high).all()):
-            return Unbounded(shape, dtype=torch.float32)
-        low, high = torch.as_tensor(space.low), torch.as_tensor(space.high)
-        return Bounded(low.expand(shape), high.expand(shape), shape=shape, dtype=torch.float32)
-    raise UserError(
-        f"{name} has actions of the kind {space}: choose a task with Discrete or one-dimensional "
-        "Box actions."
-    )

@@ -1,16 +1,21 @@
-"""Learning curves of many runs: a panel for each task and budget, a line for each kind of run."""
+"""Learning curves: the mean over seeds with its 95% interval, a line for each row of a table."""
 
 from __future__ import annotations
 
-import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
+from textwrap import wrap
+from typing import Any
 
 import numpy as np
 
-from giril_rl.files import write_atomically
 from giril_rl.report.curve import curve_points
-from giril_rl.training.metrics import read_metrics
+from giril_rl.report.drawing import new_figure, save, thousands
+from giril_rl.report.formats import budget_text, seeds_text
+from giril_rl.report.rows import Panel, Row
+from giril_rl.report.statistics import band
+from giril_rl.report.style import DEMONSTRATION, EXPERT, PALETTE, Look, look
+from giril_rl.report.tables import Table
 
 BINS = 50
 
@@ -48,49 +53,142 @@ def binned_curve(
     return curve
 
 
-def draw_curves(
-    panels: Mapping[str, Mapping[str, Sequence[Path]]], steps: Mapping[str, int], path: Path
-) -> None:
-    """Write a picture with the mean over seeds and the band between the lowest and highest seed.
+def row_curves(row: Row, bins: int = BINS) -> tuple[np.ndarray, np.ndarray] | None:
+    """Environment steps ``(points,)`` and each seed's curve ``(seeds, points)`` of a row.
+
+    None where no training episode is on record, as for a method that does not train in the
+    environment. Points before every seed has ended an episode are left out.
+    """
+    steps = max(row.trained_steps, default=0)
+    points = [curve_points(run.metrics()) for run in row.runs]
+    if not steps or not all(points):
+        return None
+    curves = np.array([binned_curve(each, steps, bins) for each in points])
+    kept = ~np.isnan(curves).any(0)
+    return ((np.arange(bins) + 1) * steps / bins)[kept], curves[:, kept]
+
+
+def draw_results(table: Table, path: Path) -> None:
+    """Write a task's picture: learned rewards on the left, controls on the right.
 
     Args:
-        panels: ``{panel title: {line's label: run folders that differ in their seed alone}}``.
-        steps: the training's length in each panel.
+        table: the task's table of results.
         path: the PNG file.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-    from matplotlib.ticker import FuncFormatter
+    rows = _longest([line.row for line in table.lines if line.row.method != "expert"])
+    parts = [
+        ("methods", [row for row in rows if not row.is_control]),
+        ("controls", [row for row in rows if row.is_control]),
+    ]
+    looks = [
+        [look(row.method, row.profile, number) for number, row in enumerate(part)]
+        for _, part in parts
+    ]
+    _draw(
+        table.panel,
+        [
+            (title, part, [row.name.removeprefix("control: ") for row in part], styles)
+            for (title, part), styles in zip(parts, looks, strict=True)
+            if part
+        ],
+        rows,
+        path,
+    )
 
-    columns = min(len(panels), 2)
-    rows = -(-len(panels) // columns)
-    figure = Figure(figsize=(6.5 * columns, 4.2 * rows), layout="constrained")
-    FigureCanvasAgg(figure)
-    grid = figure.subplots(rows, columns, squeeze=False).flatten()
-    labels = sorted({label for lines in panels.values() for label in lines})
-    colours = {label: f"C{number % 10}" for number, label in enumerate(labels)}
-    for axes, (title, lines) in zip(grid, panels.items(), strict=False):
-        where = (np.arange(BINS) + 1) * steps[title] / BINS
-        for label, folders in lines.items():
-            curves = np.array(
-                [
-                    binned_curve(curve_points(read_metrics(f / "metrics.jsonl")), steps[title])
-                    for f in folders
-                ]
-            )
-            name = f"{label} ({len(folders)} seed{'s' if len(folders) > 1 else ''})"
-            axes.plot(where, curves.mean(0), color=colours[label], label=name)
-            if len(folders) > 1:
-                band = (curves.min(0), curves.max(0))
-                axes.fill_between(where, *band, color=colours[label], alpha=0.15)
+
+def draw_varied(table: Table, path: Path) -> None:
+    """Write an ablation's picture: a part for each method, a line for each value.
+
+    Args:
+        table: the ablation's table.
+        path: the PNG file.
+    """
+    names = list(dict.fromkeys(line.row.name for line in table.lines))
+    parts = []
+    for name in names:
+        lines = [line for line in table.lines if line.row.name == name]
+        styles = [
+            Look(PALETTE[i % len(PALETTE)], "-" if i < len(PALETTE) else "--")
+            for i in range(len(lines))
+        ]
+        parts.append((name, [line.row for line in lines], [line.value for line in lines], styles))
+    _draw(table.panel, parts, [line.row for line in table.lines], path, about=table.title)
+
+
+def _longest(rows: Sequence[Row]) -> list[Row]:
+    """Of each method, the row with the largest budget."""
+    longest: dict[str, Row] = {}
+    for row in rows:
+        if row.name not in longest or row.steps > longest[row.name].steps:
+            longest[row.name] = row
+    return list(longest.values())
+
+
+def _draw(
+    panel: Panel,
+    parts: Sequence[tuple[str, Sequence[Row], Sequence[str], Sequence[Look]]],
+    rows: Sequence[Row],
+    path: Path,
+    about: str = "",
+) -> None:
+    columns = 2 if len(parts) == 4 else min(len(parts), 3)
+    lines = -(-len(parts) // columns)
+    longest = max(len(label) for _, _, labels, _ in parts for label in labels)
+    ncols = 1 if longest > 36 else 2
+    entries = max(len(part) for _, part, _, _ in parts) + 2
+    figure = new_figure(6.2 * columns, (4.6 + 0.2 * -(-entries // ncols)) * lines + 0.4)
+    grid = figure.subplots(lines, columns, squeeze=False, sharey=True, sharex=True).flatten()
+    for axes, (title, part, labels, styles) in zip(grid, parts, strict=False):
+        for row, label, style in zip(part, labels, styles, strict=True):
+            _line(axes, row, label, style)
+        for who, color, linestyle, width in (
+            ("expert", EXPERT, (0, (6, 3)), 1.0),
+            ("demo", DEMONSTRATION, (0, (1, 1)), 2.2),
+        ):
+            value = panel.reference(who)
+            if value is not None:
+                name = "demonstration" if who == "demo" else who
+                axes.axhline(
+                    value,
+                    color=color,
+                    linestyle=linestyle,
+                    linewidth=width,
+                    label=f"{name} ({value:,.1f})",
+                    zorder=1,
+                )
         axes.set_title(title)
         axes.set_xlabel("environment steps")
-        axes.set_ylabel("true return, training episodes")
-        axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.10g}"))
+        axes.set_xlim(left=0)
+        axes.tick_params(labelbottom=True, labelleft=True)
+        thousands(axes.xaxis)
+        thousands(axes.yaxis)
         axes.grid(alpha=0.3)
-        axes.legend(fontsize=8)
-    for axes in grid[len(panels) :]:
+        # Below the axes: nothing of a curve is covered.
+        axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=ncols, fontsize=8)
+    for axes in grid[::columns]:
+        axes.set_ylabel("true return of training episodes")
+    for axes in grid[len(parts) :]:
         axes.set_visible(False)
-    picture = io.BytesIO()
-    figure.savefig(picture, format="png", dpi=110)
-    write_atomically(path, picture.getvalue())
+    title = f"{panel.title}{f': {about}' if about else ''}"
+    caption = f"{seeds_text(rows)}, {budget_text(rows)}; mean and 95% bootstrap band"
+    room = 72 * columns
+    figure.suptitle("\n".join([*wrap(title, room), *wrap(caption, room)]), fontsize=11)
+    save(figure, path)
+
+
+def _line(axes: Any, row: Row, label: str, style: Look) -> None:
+    label = f"{label}, n = {len(row.runs)}"
+    found = row_curves(row)
+    if found is None:
+        axes.axhline(
+            row.estimates[0].value,
+            color=style.color,
+            linestyle=(0, (4, 2, 1, 2, 1, 2)),
+            label=f"{label} (final score)",
+        )
+        return
+    steps, curves = found
+    axes.plot(steps, curves.mean(0), color=style.color, linestyle=style.linestyle, label=label)
+    if len(curves) > 1 and len(steps):
+        low, high = band(curves)
+        axes.fill_between(steps, low, high, color=style.color, alpha=0.18, linewidth=0)

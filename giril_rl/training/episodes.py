@@ -11,8 +11,8 @@ class EpisodeTracker(nn.Module):
     """Follows undiscounted true returns across batches, whole batches at a time.
 
     Where a batch has ``("next", "scored")`` (see :class:`giril_rl.envs.FixedHorizonEnv`), only
-    those steps count, so that returns and lengths are those of the task's own episodes: one for each
-    horizon, from its beginning to the first failure.
+    those steps count, so that returns and lengths are those of the task's own episodes: one for
+    each horizon, from its beginning to the first failure.
 
     Args:
         num_envs: environments in a batch.

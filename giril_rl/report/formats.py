@@ -1,0 +1,160 @@
+"""Tables as Markdown and CSV, and the numbers and captions in them."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+from giril_rl.report.rows import Row
+from giril_rl.report.statistics import Estimate
+from giril_rl.report.tables import Line, Table
+
+COLUMNS = (
+    "table",
+    "task",
+    "task_settings",
+    "method",
+    "settings",
+    "steps",
+    "n",
+    "seeds",
+    "mean",
+    "mean_low",
+    "mean_high",
+    "iqm",
+    "iqm_low",
+    "iqm_high",
+    "mode",
+    "p_best_control",
+    "p_low",
+    "p_high",
+    "best_control",
+    "paper",
+    "each_seed",
+    "each_seed_mode",
+    "demonstration",
+    "expert",
+)
+
+
+def number(value: float | None) -> str:
+    """A score in a table.
+
+    Examples:
+        >>> number(9164.94), number(None)
+        ('9,164.9', '-')
+    """
+    return "-" if value is None else f"{value:,.1f}"
+
+
+def with_interval(estimate: Estimate, digits: int = 1) -> str:
+    """An estimate and its interval in a table.
+
+    Examples:
+        >>> with_interval(Estimate(20.0, 10.0, 30.0)), with_interval(Estimate(20.0, None, None))
+        ('20.0 [10.0, 30.0]', '20.0')
+    """
+    text = f"{estimate.value:,.{digits}f}"
+    if estimate.low is None or estimate.high is None:
+        return text
+    return f"{text} [{estimate.low:,.{digits}f}, {estimate.high:,.{digits}f}]"
+
+
+def steps_text(row: Row) -> str:
+    """Environment steps of a row's training; a range where runs stopped early.
+
+    Examples:
+        >>> steps_text(Row("giril", None, (), 1000))
+        '0'
+    """
+    taken = row.trained_steps or [0]
+    return f"{taken[0]:,}" if len(taken) == 1 else f"{taken[0]:,} to {taken[-1]:,}"
+
+
+def seeds_text(rows: Iterable[Row]) -> str:
+    """How many seeds rows have, for a caption; an expert's are not among them.
+
+    Examples:
+        >>> seeds_text([]), seeds_text([Row("giril", None, (), 1000)])
+        ('no seeds', '0 seeds')
+    """
+    counts = sorted({len(row.runs) for row in rows if row.method != "expert"})
+    if not counts:
+        return "no seeds"
+    words = f"{counts[0]}" if len(counts) == 1 else f"{counts[0]} to {counts[-1]}"
+    return f"{words} seed{'' if counts == [1] else 's'}"
+
+
+def budget_text(rows: Iterable[Row]) -> str:
+    """The budgets of rows, for a caption: not an expert's, and not of what takes no steps.
+
+    Examples:
+        >>> budget_text([Row("bc", None, (), 0)])
+        'no environment steps'
+    """
+    budgets = sorted({row.steps for row in rows if row.is_trained and row.method != "expert"})
+    return f"{' and '.join(f'{steps:,}' for steps in budgets) or 'no'} environment steps"
+
+
+def markdown(table: Table) -> str:
+    """The table as Markdown, without its caption."""
+    varied = table.name != "results"
+    head = ["method", *(["setting"] if varied else []), "n", "steps", "mean [95%]", "IQM [95%]"]
+    head += ["mode", "P(> best control) [95%]", "paper", "each seed"]
+    cells = [head, ["---"] * len(head)]
+    for line in table.lines:
+        row = line.row
+        mean, middle = row.estimates
+        cells.append(
+            [
+                row.name,
+                *([line.value] if varied else []),
+                str(len(row.runs)),
+                steps_text(row),
+                with_interval(mean),
+                with_interval(middle),
+                number(sum(row.modes) / len(row.modes) if row.modes else None),
+                with_interval(line.improvement[0], 2) if line.improvement else "-",
+                number(line.paper.value if line.paper else None),
+                " ".join(number(score) for score in row.scores),
+            ]
+        )
+    return "\n".join(f"| {' | '.join(row)} |" for row in cells) + "\n"
+
+
+def to_csv(tables: Sequence[Table]) -> str:
+    """All lines of all tables as CSV with the columns :data:`COLUMNS`, numbers unrounded."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(COLUMNS)
+    writer.writerows(_cells(table, line) for table in tables for line in table.lines)
+    return text.getvalue()
+
+
+def _cells(table: Table, line: Line) -> list[Any]:
+    row, panel = line.row, line.panel
+    mean, middle = row.estimates
+    better = line.improvement
+    values = [
+        table.name,
+        panel.task,
+        " ".join(f"{key}={value}" for key, value in panel.changes),
+        row.name,
+        line.value,
+        " ".join(map(str, row.trained_steps)),
+        len(row.runs),
+        " ".join(map(str, row.seeds)),
+        *mean,
+        *middle,
+        sum(row.modes) / len(row.modes) if row.modes else None,
+        *(better[0] if better else (None, None, None)),
+        better[1].name if better else None,
+        line.paper.value if line.paper else None,
+        " ".join(map(str, row.scores)),
+        " ".join(map(str, row.modes)),
+        panel.reference("demo"),
+        panel.reference("expert"),
+    ]
+    return ["" if value is None else value for value in values]

@@ -1,0 +1,175 @@
+"""``giril report``: all runs below a folder as Markdown, CSV and PNG."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Sequence
+from pathlib import Path
+
+from giril_rl.files import write_atomically
+from giril_rl.naming import safe
+from giril_rl.report.bars import draw_bars
+from giril_rl.report.curves import draw_results, draw_varied
+from giril_rl.report.formats import budget_text, markdown, seeds_text, steps_text, to_csv
+from giril_rl.report.overall import overall
+from giril_rl.report.rows import Panel, panels_of
+from giril_rl.report.runs import RunRecord, Unfinished, read_runs
+from giril_rl.report.statistics import RESAMPLES, load_rliable
+from giril_rl.report.tables import Table, tables_of
+
+_RUN_COLUMNS = (
+    "folder",
+    "state",
+    "method",
+    "task",
+    "profile",
+    "seed",
+    "reward_seed",
+    "env_steps",
+    "return_mean",
+    "mode_return_mean",
+    "wall_seconds",
+    "config_hash",
+    "last_line",
+)
+
+
+def write_report(folder: Path, out: Path) -> str:
+    """Write ``report.md``, ``results.csv``, ``runs.csv`` and the pictures.
+
+    Args:
+        folder: where runs are, at any depth.
+        out: where to write; made if need be.
+
+    Returns:
+        One line that says what was written.
+
+    Raises:
+        UserError: where there is no finished run, or rliable is missing.
+    """
+    load_rliable()
+    runs, unfinished = read_runs(folder)
+    panels = panels_of(runs)
+    tables = [table for panel in panels for table in tables_of(panel)]
+    out.mkdir(parents=True, exist_ok=True)
+    bars = draw_bars(panels, out / "normalised.png")
+    sections = [_head(runs, unfinished)]
+    if bars:
+        sections.append(
+            "## All tasks\n\n![scores normalised to the demonstration](normalised.png)\n"
+        )
+        sections.append(overall(panels))
+    sections += [_section(table, out) for table in tables]
+    sections += [_leftovers(panels), _without_result(unfinished)]
+    write_atomically(out / "report.md", "\n".join(text for text in sections if text))
+    write_atomically(out / "results.csv", to_csv(tables))
+    write_atomically(out / "runs.csv", _runs_csv(runs, unfinished))
+    missing = f", {len(unfinished)} without a result" if unfinished else ""
+    return f"{len(runs)} finished runs in {len(tables)} tables{missing}: {out / 'report.md'}"
+
+
+def _head(runs: Sequence[RunRecord], unfinished: Sequence[Unfinished]) -> str:
+    episodes = sorted({int(run.result["episodes"]) for run in runs if run.result})
+    missing = (
+        f" {len(unfinished)} runs have no result; they are [listed at the end](#without-a-result)."
+        if unfinished
+        else ""
+    )
+    return (
+        "# Results\n\n"
+        f"{len(runs)} finished runs.{missing} A score is the task's own return, the mean over "
+        f"{' or '.join(map(str, episodes))} whole episodes on fresh environments: of the policy as "
+        "trained, which samples its actions, and under `mode` of the same policy playing its most "
+        "likely action. `n` is the number of seeds, `steps` what the policy trained for. Intervals "
+        f"are 95% stratified bootstrap intervals over seeds (rliable, {RESAMPLES:,} resamples); "
+        "with few seeds they are too narrow: read the seeds. IQM is the interquartile mean. "
+        "`P(> best control)` is the probability that a run of the method scores above a run of the "
+        "control with the highest mean on that task at that budget, a draw counting one half; that "
+        "control was chosen by these same runs. `paper` is the paper's mean.\n"
+    )
+
+
+def _section(table: Table, out: Path) -> str:
+    panel, rows = table.panel, [line.row for line in table.lines]
+    heading = "##" if table.name == "results" else "###"
+    text = [f"{heading} {panel.title}: {table.title[0].lower()}{table.title[1:]}\n"]
+    text += [_caption(table), markdown(table)]
+    name = f"curves-{safe(panel.title.replace(', ', '-'))}"
+    if table.name == "results":
+        trained = [row for row in rows if row.method != "expert"]
+        if trained:
+            draw_results(table, out / f"{name}.png")
+            text.append(_picture(f"{name}.png", f"learning curves, {panel.title}"))
+    else:
+        draw_varied(table, out / f"{name}-{table.name}.png")
+        text.append(_picture(f"{name}-{table.name}.png", f"{table.title}, {panel.title}"))
+    return "\n".join(text)
+
+
+def _picture(file: str, words: str) -> str:
+    return f"![{words}]({file})\n"
+
+
+def _caption(table: Table) -> str:
+    panel, rows = table.panel, [line.row for line in table.lines]
+    parts = [f"{seeds_text(rows)}, {budget_text(rows)}."]
+    references = [
+        f"{words} {value:,.1f}"
+        for words, value in (
+            ("demonstration", panel.reference("demo")),
+            ("expert", panel.reference("expert")),
+        )
+        if value is not None
+    ]
+    if references:
+        parts.append(f"Scores of the {' and of the '.join(references)}.")
+    controls = [line.improvement[1] for line in table.lines if line.improvement]
+    if controls:
+        names = {f"{row.name.removeprefix('control: ')} ({steps_text(row)})" for row in controls}
+        parts.append(f"Best control at its budget of steps: {'; '.join(sorted(names))}.")
+    sources = sorted({line.paper.source for line in table.lines if line.paper})
+    if sources:
+        parts.append(f"Paper: {'; '.join(sources)}.")
+    if panel.shared:
+        shared = " ".join(f"{key}={value}" for key, value in panel.shared)
+        parts.append(f"All runs have `{shared}`.")
+    if any(key == "task.horizon" for key, _ in panel.changes):
+        parts.append("Curves are of training episodes; scores are of episodes that a failure ends.")
+    return " ".join(parts) + "\n"
+
+
+def _leftovers(panels: Sequence[Panel]) -> str:
+    repeats = [run for panel in panels for run in panel.repeats]
+    if not repeats:
+        return ""
+    lines = "\n".join(f"- `{run.name}`" for run in repeats)
+    return (
+        f"## Repeated runs\n\nThese repeat a seed of a row above and are not counted.\n\n{lines}\n"
+    )
+
+
+def _without_result(unfinished: Sequence[Unfinished]) -> str:
+    if not unfinished:
+        return ""
+    lines = ["| run | state | steps | last line |", "|---|---|---|---|"]
+    for run in unfinished:
+        reason = run.reason.replace("|", "\\|")
+        lines.append(f"| `{run.name}` | {run.state} | {run.steps or '-'} | {reason or '-'} |")
+    return "## Without a result\n\n" + "\n".join(lines) + "\n"
+
+
+def _runs_csv(runs: Sequence[RunRecord], unfinished: Sequence[Unfinished]) -> str:
+    text = io.StringIO()
+    writer = csv.DictWriter(text, _RUN_COLUMNS, lineterminator="\n", restval="")
+    writer.writeheader()
+    for run in runs:
+        result = run.result or {}
+        row = {key: result.get(key) for key in _RUN_COLUMNS}
+        row["folder"], row["state"] = run.name, "finished"
+        row["reward_seed"] = result.get("seeds", {}).get("reward")
+        row["mode_return_mean"] = (result.get("deterministic") or {}).get("return_mean")
+        writer.writerow({key: value for key, value in row.items() if value is not None})
+    for other in unfinished:
+        writer.writerow({"folder": other.name, "state": other.state, "last_line": other.reason})
+    return text.getvalue()

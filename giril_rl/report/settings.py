@@ -1,0 +1,133 @@
+"""In what a run's settings differ from its recipe's own, and which of that makes it another row."""
+
+from __future__ import annotations
+
+import json
+from collections import defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict
+from functools import cache
+from typing import Any
+
+from giril_rl.errors import UserError
+from giril_rl.naming import NO_EFFECT
+from giril_rl.report.runs import RunRecord, flat
+
+WITHOUT_PROFILE = frozenset({"expert", "gail", "vail", "bc", "control:random"})
+"""Methods that never average rewards over environments, so that both profiles are one run."""
+# A control's `reward` is a part of its method's name.
+_IDENTITY = NO_EFFECT | {"recipe", "seed", "steps", "task.name", "task.steps", "profile", "reward"}
+Changes = tuple[tuple[str, str], ...]
+"""``(key, value as text)`` of the settings that are not the recipe's own, by key."""
+
+
+@cache
+def _defaults(recipe: str, task: str, env_id: str) -> dict[str, Any] | None:
+    """A shipped recipe's own settings on a task, flat; None where there is no such recipe."""
+    from giril_rl.compose import groups, resolved
+    from giril_rl.recipe_config import config_class
+    from giril_rl.recipes import find
+
+    try:
+        found = find(recipe)
+        shipped = task in groups(found)["task"][0]
+        text = f"task={task}" if shipped else f"task.env_id={env_id}"
+        config = resolved(found, config_class(found), [text])[0]
+    except (UserError, KeyError):
+        return None
+    return flat(json.loads(json.dumps(asdict(config))))
+
+
+def text_of(value: Any) -> str:
+    """A setting as it is written on the command line.
+
+    Examples:
+        >>> text_of(None), text_of(True), text_of([64, 64]), text_of(0.5)
+        ('null', 'true', '[64,64]', '0.5')
+    """
+    if value is None or isinstance(value, bool):
+        return {None: "null", True: "true", False: "false"}[value]
+    return str(value).replace(" ", "") if isinstance(value, list) else str(value)
+
+
+def changes_of(runs: Sequence[RunRecord]) -> dict[str, Changes]:
+    """For each run's name, the settings that differ from what its recipe has for its task.
+
+    A run of a recipe that is not shipped is compared with what most runs of that recipe have. A
+    key that a run was made without, before it existed, is no difference.
+    """
+    usual = _usual(runs)
+    found = {}
+    for run in runs:
+        task, env_id = str(run.config["task.name"]), str(run.config.get("task.env_id"))
+        base = _defaults(run.recipe, task, env_id) or usual[run.recipe, task]
+        differing = {
+            key: text_of(value)
+            for key, value in run.config.items()
+            if key not in _IDENTITY
+            and not _averaging_follows(run, key, value)
+            and not (key in base and base[key] == value)
+        }
+        found[run.name] = tuple(sorted(differing.items()))
+    return found
+
+
+def _averaging_follows(run: RunRecord, key: str, value: Any) -> bool:
+    """Whether ``batch_mean`` is only what the profile says."""
+    if key != "batch_mean":
+        return False
+    return uses_profile(run) is False or value == (run.config.get("profile") == "released")
+
+
+def uses_profile(run: RunRecord) -> bool:
+    """Whether the profile makes a difference to the run's method."""
+    return method_of(run) not in WITHOUT_PROFILE
+
+
+def method_of(run: RunRecord) -> str:
+    """The method's name: the result's, else the recipe's."""
+    return str((run.result or {}).get("method", run.recipe))
+
+
+def _usual(runs: Iterable[RunRecord]) -> dict[tuple[str, str], dict[str, Any]]:
+    values: dict[tuple[str, str], dict[str, list[Any]]] = defaultdict(lambda: defaultdict(list))
+    for run in runs:
+        for key, value in run.config.items():
+            values[run.recipe, str(run.config["task.name"])][key].append(value)
+    return {
+        place: {key: max(each, key=each.count) for key, each in found.items()}
+        for place, found in values.items()
+    }
+
+
+def split_task(changes: Changes) -> tuple[Changes, Changes]:
+    """The changes that make the task another one, and the others.
+
+    Examples:
+        >>> split_task((("ppo.lr", "0.1"), ("task.horizon", "fixed"), ("termination", "bootstrap")))
+        ((('task.horizon', 'fixed'), ('termination', 'bootstrap')), (('ppo.lr', '0.1'),))
+    """
+    of_task = tuple(c for c in changes if c[0].startswith("task.") or c[0] == "termination")
+    return of_task, tuple(c for c in changes if c not in of_task)
+
+
+def shared_changes(
+    runs: Sequence[RunRecord], changes: Mapping[str, Changes], keep: frozenset[str]
+) -> Changes:
+    """Changes that all runs of one task have in common: the study's own settings, no row's.
+
+    A key counts where runs of at least two methods have it and all that have it agree.
+
+    Args:
+        runs: runs of one task.
+        changes: of each run, by its name.
+        keep: keys that a table is about; they always make rows.
+    """
+    candidates = {change for run in runs for change in changes[run.name] if change[0] not in keep}
+    found = []
+    for change in sorted(candidates):
+        having = [run for run in runs if change[0] in run.config and method_of(run) != "expert"]
+        methods = {method_of(run) for run in having}
+        if len(methods) > 1 and all(change in changes[run.name] for run in having):
+            found.append(change)
+    return tuple(found)

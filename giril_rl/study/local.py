@@ -1,0 +1,78 @@
+"""Runs as processes of this machine."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+from giril_rl.study.plan import StudyRun
+
+
+class LocalLauncher:
+    """Starts each run as a process of its own, its output in a log file.
+
+    A process is the leader of its own group, so that Ctrl-C in the terminal reaches it only through
+    :meth:`interrupt`.
+    """
+
+    def __init__(self) -> None:
+        self._running: dict[str, tuple[StudyRun, subprocess.Popen[bytes]]] = {}
+        # A process that was started in the background ignores SIGINT, and so do its children.
+        ignored = signal.getsignal(signal.SIGINT) in (signal.SIG_IGN, None)
+        self._gently = signal.SIGTERM if ignored else signal.SIGINT
+
+    @property
+    def slots(self) -> int:
+        """How many runs this machine has cores for."""
+        return (
+            len(os.sched_getaffinity(0))
+            if hasattr(os, "sched_getaffinity")
+            else os.cpu_count() or 1
+        )
+
+    def start(self, run: StudyRun, log: Path) -> None:
+        """Start a run; what it prints is added to ``log``."""
+        log.parent.mkdir(parents=True, exist_ok=True)
+        with open(log, "ab") as output:
+            output.write(f"\n$ giril {' '.join(run.command)}\n".encode())
+            output.flush()
+            process = subprocess.Popen(
+                [sys.executable, "-m", "giril_rl.cli", *run.command],
+                stdin=subprocess.DEVNULL,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                # Numerical libraries would each take all cores.
+                env={"OMP_NUM_THREADS": str(run.config.threads), **os.environ},
+                process_group=0,
+            )
+        self._running[run.name] = run, process
+
+    def poll(self) -> list[tuple[StudyRun, int]]:
+        """Runs that have ended since the last call, with their exit codes."""
+        ended = [(run, process.poll()) for run, process in self._running.values()]
+        found = [(run, code) for run, code in ended if code is not None]
+        for run, _ in found:
+            del self._running[run.name]
+        return found
+
+    def interrupt(self) -> None:
+        """Ask all runs to save their state and stop."""
+        self._send(self._gently)
+
+    def kill(self) -> None:
+        """Stop all runs at once."""
+        self._send(signal.SIGKILL)
+
+    def close(self) -> None:
+        """Nothing is left running."""
+        self.kill()
+        for _, process in self._running.values():
+            process.wait()
+        self._running.clear()
+
+    def _send(self, number: signal.Signals) -> None:
+        for _, process in self._running.values():
+            process.send_signal(number)

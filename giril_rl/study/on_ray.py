@@ -1,0 +1,120 @@
+"""Runs as tasks of a Ray cluster, whose machines share the folders with this one."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import logging
+import os
+import signal
+from pathlib import Path
+from typing import Any
+
+from giril_rl.errors import UserError
+from giril_rl.study.plan import StudyRun
+
+KILLED = -int(signal.SIGKILL)
+"""The code of a run whose worker is gone."""
+INTERRUPTED = 130
+
+
+class RayLauncher:
+    """Hands each run to a Ray worker that does nothing else, its output in a log file.
+
+    The run takes place in the worker itself rather than in a process below it: when a worker is
+    killed, nothing stays behind that holds the run's folder.
+
+    Args:
+        address: the cluster's address, ``auto`` for one that runs on this machine.
+
+    Raises:
+        UserError: where Ray is not installed, or no cluster answers.
+    """
+
+    def __init__(self, address: str) -> None:
+        if importlib.util.find_spec("ray") is None:
+            raise UserError(
+                'launcher=ray needs the package ray: pip install "giril-rl[ray]", or leave it out.'
+            )
+        import ray
+
+        self._ray = ray
+        try:
+            ray.init(address=address, log_to_driver=False, logging_level=logging.ERROR)
+        except (ConnectionError, RuntimeError, ValueError, TimeoutError) as error:
+            raise UserError(
+                f"no Ray cluster answers at ray_address={address}: start one with "
+                "`ray start --head`, or give its address."
+            ) from error
+        # One run a process: `max_calls` ends the worker after it, as a command ends.
+        self._remote = ray.remote(max_retries=0, max_calls=1)(run_in_worker)
+        self._running: dict[Any, StudyRun] = {}
+
+    @property
+    def slots(self) -> int:
+        """How many CPUs the cluster has at the moment."""
+        return max(int(self._ray.cluster_resources().get("CPU", 1)), 1)
+
+    def start(self, run: StudyRun, log: Path) -> None:
+        """Hand a run to the cluster; what it prints is added to ``log``."""
+        task = self._remote.options(num_cpus=run.config.threads, name=run.name)
+        reference = task.remote(run.command, str(log.absolute()), str(Path.cwd()))
+        self._running[reference] = run
+
+    def poll(self) -> list[tuple[StudyRun, int]]:
+        """Runs that have ended since the last call, with their exit codes."""
+        if not self._running:
+            return []
+        waiting = list(self._running)
+        ended, _ = self._ray.wait(waiting, num_returns=len(waiting), timeout=0)
+        return [(self._running.pop(reference), self._code(reference)) for reference in ended]
+
+    def _code(self, reference: Any) -> int:
+        errors = self._ray.exceptions
+        try:
+            return self._ray.get(reference)
+        except errors.TaskCancelledError:
+            return INTERRUPTED
+        except errors.RayTaskError:
+            return 1
+        except errors.RayError:
+            return KILLED
+
+    def interrupt(self) -> None:
+        """Ask all runs to save their state and stop."""
+        self._cancel(force=False)
+
+    def kill(self) -> None:
+        """Stop all runs at once."""
+        self._cancel(force=True)
+
+    def close(self) -> None:
+        """Leave the cluster, which ends what still runs there."""
+        self._ray.shutdown()
+
+    def _cancel(self, *, force: bool) -> None:
+        for reference in self._running:
+            # One that has ended in the meantime cannot be cancelled.
+            with contextlib.suppress(self._ray.exceptions.RayError, ValueError):
+                self._ray.cancel(reference, force=force)
+
+
+def run_in_worker(command: list[str], log: str, folder: str) -> int:
+    """Make a run inside a Ray worker, as ``giril`` would, and return the exit code.
+
+    Args:
+        command: the words after ``giril``.
+        log: the file that the output is added to.
+        folder: the working directory.
+    """
+    os.chdir(folder)
+    Path(log).parent.mkdir(parents=True, exist_ok=True)
+    with open(log, "a", buffering=1, encoding="utf-8") as output:
+        output.write(f"\n$ giril {' '.join(command)}\n")
+        # Both what Python prints and what a simulator writes to the bare descriptors.
+        for descriptor in (1, 2):
+            os.dup2(output.fileno(), descriptor)
+        with contextlib.redirect_stdout(output), contextlib.redirect_stderr(output):
+            from giril_rl.cli import main
+
+            return main(command)

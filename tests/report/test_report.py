@@ -1,0 +1,186 @@
+"""The command on made-up runs: every finished run is in a table, every other one is listed."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+
+from giril_rl.cli import main
+from giril_rl.report.curves import binned_curve, row_curves
+from giril_rl.report.rows import panels_of
+from giril_rl.report.runs import read_runs
+
+
+@pytest.fixture
+def runs(made):
+    for seed in range(3):
+        made("giril", f"seed={seed}", score=900.0 + seed, mode=800.0)
+        made("giril", f"seed={seed}", "reward.beta=0.9", score=700.0 + seed)
+        made("control", f"seed={seed}", score=500.0)
+        made("bc", f"seed={seed}", score=300.0)
+    made("giril", "task=inverted_double_pendulum", score=4000.0, demo_return_mean=9000.0)
+    made("expert", score=950.0)
+    return made
+
+
+def report(made, capsys, code=0):
+    out = made.root.parent / "out"
+    assert main(["report", str(made.root), "--out", str(out)]) == code
+    return out, capsys.readouterr()
+
+
+def test_tables_and_pictures(runs, capsys):
+    out, captured = report(runs, capsys)
+    assert captured.out == f"14 finished runs in 3 tables: {out}/report.md\n"
+    text = (out / "report.md").read_text()
+    assert "## inverted_pendulum: results\n\n3 seeds, 300,000 environment steps." in text
+    assert "Scores of the demonstration 1,000.0 and of the expert 900.0." in text
+    assert "Paper: Table 5, 10,000,000 steps, 3 seeds." in text
+    line = (
+        "| GIRIL (released) | 3 | 300,000 | 901.0 [900.0, 902.0] | 901.0 [900.0, 902.0] | 800.0 "
+        "| 1.00 [1.00, 1.00] | 990.2 | 900.0 901.0 902.0 |"
+    )
+    assert line in text
+    assert "| BC | 3 | 0 | 300.0 [300.0, 300.0] |" in text
+    assert "β = 0.9 | 3 | 300,000 | 701.0" in text
+    pictures = {path.name: path.read_bytes() for path in out.glob("*.png")}
+    assert set(pictures) == {
+        "normalised.png",
+        "curves-inverted_pendulum.png",
+        "curves-inverted_pendulum-beta.png",
+        "curves-inverted_double_pendulum.png",
+    }
+    for name, content in pictures.items():
+        assert content.startswith(b"\x89PNG")
+        assert f"]({name})" in text
+
+
+def test_csv_has_unrounded_numbers(runs, capsys):
+    out, _ = report(runs, capsys)
+    rows = list(csv.DictReader((out / "results.csv").open()))
+    (giril,) = [
+        r
+        for r in rows
+        if r["method"] == "GIRIL (released)" and r["steps"] == "300000" and r["table"] == "results"
+    ]
+    assert giril["each_seed"] == "900.0 901.0 902.0"
+    assert [float(giril[key]) for key in ("mean", "iqm", "mode", "paper", "p_best_control")] == [
+        901.0,
+        901.0,
+        800.0,
+        990.2,
+        1.0,
+    ]
+    assert (giril["seeds"], giril["n"], giril["best_control"]) == (
+        "0 1 2",
+        "3",
+        "control: constant",
+    )
+    each = list(csv.DictReader((out / "runs.csv").open()))
+    assert len(each) == 14
+    assert {row["state"] for row in each} == {"finished"}
+    (one,) = [row for row in each if row["folder"] == "giril/inverted_pendulum/seed=1"]
+    assert (one["seed"], one["reward_seed"], one["return_mean"]) == ("1", "101", "901.0")
+
+
+def test_all_tasks_together(made, capsys):
+    for task, demo in (("inverted_pendulum", 1000.0), ("inverted_double_pendulum", 9000.0)):
+        for seed in range(2):
+            words = (f"task={task}", f"seed={seed}")
+            made("giril", *words, score=demo / 2, demo_return_mean=demo)
+            if task == "inverted_pendulum":
+                made("control", *words, score=500.0)
+    out, _ = report(made, capsys)
+    text = (out / "report.md").read_text()
+    assert "| GIRIL (released) | 2 | 0.50 [0.50, 0.50] | 0.50 [0.50, 0.50] |" in text
+    assert "Not on every task, and so not here: control: constant." in text
+
+
+def test_a_demonstration_without_a_positive_score_has_no_bars(made, capsys):
+    made("giril", score=-5.0, demo_return_mean=-2.0)
+    out, _ = report(made, capsys)
+    assert not (out / "normalised.png").exists()
+    assert "normalised.png" not in (out / "report.md").read_text()
+
+
+def test_runs_without_a_result_are_listed(runs, capsys):
+    runs("giril", "seed=8")
+    runs("giril", "seed=9")
+    broken = runs("giril", "seed=7", score=3.0)
+    (broken / "config.yaml").write_text("a: [")
+    folder = runs.root / "studies" / "mine"
+    folder.mkdir(parents=True)
+    rows = [
+        ("giril/inverted_pendulum/seed=9", "failed", "RuntimeError: a | b"),
+        ("giril/inverted_pendulum/seed=1", "failed", "finished since"),
+        ("giril/inverted_pendulum/seed=30", "waiting", None),
+    ]
+    entries = [dict(zip(("folder", "state", "last_line"), row, strict=True)) for row in rows]
+    (folder / "status.json").write_text(json.dumps({"runs": entries}))
+    out, captured = report(runs, capsys)
+    assert captured.out.startswith("14 finished runs in 3 tables, 4 without a result: ")
+    text = (out / "report.md").read_text()
+    place = "giril/inverted_pendulum"
+    assert text.split("## Without a result")[1].strip().splitlines() == [
+        "| run | state | steps | last line |",
+        "|---|---|---|---|",
+        f"| `{place}/seed=30` | not finished yet | - | - |",
+        f"| `{place}/seed=7` | unfinished | - | its config.yaml cannot be read |",
+        f"| `{place}/seed=8` | unfinished | 300,000 of 300,000 | - |",
+        f"| `{place}/seed=9` | failed | 300,000 of 300,000 | RuntimeError: a \\| b |",
+    ]
+    states = [row["state"] for row in csv.DictReader((out / "runs.csv").open())]
+    assert states.count("finished") == 14 and states.count("failed") == 1
+
+
+def test_a_folder_without_finished_runs_is_refused(made, capsys):
+    made("giril")
+    _, captured = report(made, capsys, code=2)
+    (line,) = captured.err.splitlines()
+    assert line.startswith(f"giril: there is no finished run below {made.root}: ")
+
+
+def test_the_same_runs_give_the_same_report(runs, capsys):
+    out, _ = report(runs, capsys)
+    before = {path.name: path.read_bytes() for path in out.iterdir()}
+    report(runs, capsys)
+    assert {path.name: path.read_bytes() for path in out.iterdir()} == before
+
+
+def test_a_curve_weighs_episodes_and_repeats_over_gaps():
+    points = [(10, 1.0, 3), (20, 5.0, 1), (90, 7.0, None)]
+    curve = binned_curve(points, steps=100, bins=5)
+    assert curve.tolist() == [2.0, 2.0, 2.0, 2.0, 7.0]
+    assert np.isnan(binned_curve(points[2:], steps=100, bins=5)[:4]).all()
+
+
+def test_curves_of_a_row(runs):
+    (_, pendulum) = panels_of(read_runs(runs.root)[0])
+    rows = {(row.name, row.settings): row for row in pendulum.rows}
+    steps, curves = row_curves(rows["GIRIL (released)", ""], bins=4)
+    assert steps.tolist() == [75_000, 150_000, 225_000, 300_000]
+    assert curves.tolist() == [[s / 4, s / 2, s * 0.75, s] for s in (900.0, 901.0, 902.0)]
+    assert row_curves(rows["BC", ""]) is None
+
+
+def test_the_legend_covers_no_curve(runs, monkeypatch, tmp_path):
+    from matplotlib.figure import Figure
+
+    drawn = []
+    savefig = Figure.savefig
+    monkeypatch.setattr(
+        Figure, "savefig", lambda self, *a, **k: (savefig(self, *a, **k), drawn.append(self))
+    )
+    assert main(["report", str(runs.root), "--out", str(tmp_path / "out")]) == 0
+    legends = [
+        ([text.get_text() for text in legend.get_texts()], legend, axes)
+        for figure in drawn
+        for axes in figure.axes
+        if (legend := axes.get_legend()) is not None
+    ]
+    assert len(legends) == 4  # Methods and controls of one task, methods of the other, beta.
+    for names, legend, axes in legends:
+        assert legend.get_window_extent().y1 <= axes.get_window_extent().y0
+        assert any(name.startswith("demonstration (") for name in names)
+    assert ["GIRIL (released), n = 3", "BC, n = 3 (final score)"] in [n[:2] for n, _, _ in legends]

@@ -1,0 +1,175 @@
+"""Every run of a study is composed and checked before the first one starts."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from giril_rl.cli import main
+from giril_rl.compose import groups
+from giril_rl.errors import UserError
+from giril_rl.naming import config_hash
+from giril_rl.recipes import find
+from giril_rl.study.plan import Planner
+from giril_rl.study.spec import find_study, read_spec
+
+
+def plan(name, *changes):
+    return Planner(Path("runs")).plan(read_spec(find_study(name)), changes)
+
+
+def test_runs_are_all_combinations_and_their_folders_those_of_giril_run(study):
+    name = study("groups: [{label: a, recipe: fake.py, seed: [0, 1], ppo.lr: [0.1, 0.2]}]")
+    runs = plan(name)
+    place = "fake/inverted_pendulum"
+    assert {run.name for run in runs} == {
+        f"{place}/ppo.lr={lr}/seed{seed}" for lr in (0.1, 0.2) for seed in (0, 1)
+    }
+    assert [(run.config.ppo.lr, run.config.seed) for run in runs][:2] == [(0.1, 0), (0.2, 0)]
+    for run in runs:
+        assert run.folder == Path("runs") / run.name
+        assert main(run.command) == 0
+        assert run.finished
+        assert json.loads((run.folder / "result.json").read_text())["config_hash"] == config_hash(
+            run.config
+        )
+
+
+def test_a_knob_at_its_own_value_is_left_out_and_the_run_shared(study):
+    name = study(
+        """
+all: {task: inverted_double_pendulum, seed: 3}
+groups:
+  - label: a
+    recipe: fake.py
+    steps: 1_000_000
+    profile: released
+    widths: [4]
+    ppo.clip: [0.1, 0.2]
+"""
+    )
+    own, other = plan(name)
+    # 1M is the task's own budget; the other task's is 300,000.
+    assert own.name == "fake/inverted_double_pendulum/default/seed3"
+    assert own.words == ("task=inverted_double_pendulum", "seed=3")
+    assert other.name == "fake/inverted_double_pendulum/ppo.clip=0.2/seed3"
+    (run, _) = plan(name, "task=inverted_pendulum")
+    assert run.name == "fake/inverted_pendulum/steps=1000000/seed3"
+
+
+def test_a_knob_stays_where_another_one_moves_its_default(study):
+    name = study("groups: [{label: a, recipe: fake.py, task.steps: 70000, steps: 300000}]")
+    (run,) = plan(name)
+    assert (run.config.steps, run.config.task.steps) == (300_000, 70_000)
+    assert run.name == "fake/inverted_pendulum/steps=300000,task.steps=70000/seed0"
+
+
+def test_the_command_line_takes_the_place_of_every_groups_own(study):
+    name = study(
+        "groups: [{label: a, recipe: fake.py, seed: [0, 1]}, {label: b, recipe: fake.py, how: bug}]"
+    )
+    runs = plan(name, "seed=5,6", "ppo.lr=0.5")
+    assert [(run.label, run.config.seed, run.config.ppo.lr) for run in runs] == [
+        ("a", 5, 0.5),
+        ("a", 6, 0.5),
+        ("b", 5, 0.5),
+        ("b", 6, 0.5),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        (
+            "groups: [{label: a, recipe: fak}]",
+            "mine, group 'a': 'fak' is not a recipe",
+        ),
+        (
+            "groups: [{label: a, recipe: fake.py, ppo.learning_rate: 1}]",
+            "mine, group 'a': 'ppo.learning_rate' is not a key of fake.py; did you mean 'ppo.lr'?",
+        ),
+        (
+            "groups: [{label: a, recipe: fake.py}, {label: b, recipe: fake.py, seed: [1, x]}]",
+            "mine, group 'b': seed=x: a whole number is needed.",
+        ),
+        (
+            "groups: [{label: a, recipe: fake.py, seed: [0, -1]}]",
+            "mine, group 'a': seed=-1 must be at least 0.",
+        ),
+        (
+            "groups: [{label: a, recipe: fake.py, ppo.clip: 0}]",
+            "mine, group 'a': ppo.clip=0.0 must be above 0.",
+        ),
+        (
+            "groups: [{label: a, recipe: fake.py, widths: [2, 0]}]",
+            "mine, group 'a': widths=[2,0]: each entry must be at least 1.",
+        ),
+        (
+            "groups: [{label: a, recipe: fake.py, task: pong}]",
+            "mine, group 'a': task=pong: choose one of ",
+        ),
+        (
+            "groups: [{label: a, recipe: fake.py, out: x}]",
+            "mine, group 'a': out is not a knob of a study's runs",
+        ),
+        (
+            "groups: [{label: a, recipe: fake.py}, {label: b, recipe: fake.py, profile: released}]",
+            "mine: groups 'a' and 'b' both ask for the run fake/inverted_pendulum/default/seed0: ",
+        ),
+        (
+            "groups: [{label: a, recipe: fake.py, seed: [1, 1]}]",
+            "mine: group 'a' asks twice for the run fake/inverted_pendulum/default/seed1: ",
+        ),
+    ],
+)
+def test_refusals(study, capsys, text, sentence):
+    assert main(["study", study(text)]) == 2
+    captured = capsys.readouterr()
+    (line,) = captured.err.splitlines()
+    assert line.startswith(f"giril: {sentence}")
+    assert captured.out == ""
+    assert not Path("runs").exists()
+
+
+def test_a_finished_run_of_other_settings_is_refused(study):
+    name = study("groups: [{label: a, recipe: fake.py}]")
+    folder = Path("runs/fake/inverted_pendulum/default/seed0")
+    folder.mkdir(parents=True)
+    (folder / "result.json").write_text(json.dumps({"config_hash": "0123456789ab"}))
+    with pytest.raises(UserError, match="holds a finished run with other settings"):
+        plan(name)
+
+
+STUDIES = ("smoke", "pybullet", "pybullet-ablations", "pybullet-no-survival")
+
+
+def test_every_shipped_study_fits_the_recipes():
+    """Recipes, keys, types and values; the tasks by their names, for composing takes its time."""
+    planner = Planner(Path("runs"))
+    tasks = groups(find("giril"))["task"][0]
+    for name in STUDIES:
+        spec = read_spec(find_study(name))
+        for group in spec.groups:
+            named = group.knobs["task"]
+            assert set(named if isinstance(named, list) else [named]) <= set(tasks)
+        assert planner.plan(spec, ["task=inverted_pendulum"])
+
+
+@pytest.mark.slow
+def test_shipped_studies_hold_what_they_say():
+    planner = Planner(Path("runs"))
+    plans = {name: planner.plan(read_spec(find_study(name))) for name in STUDIES}
+    counts = {name: len(runs) for name, runs in plans.items()}
+    # 2 experts; on 2 tasks with 5 seeds: 2 methods in 2 profiles, 2 adversarial, BC, 8 controls.
+    assert counts["pybullet"] == 2 + 2 * 5 * (2 * 2 + 2 + 1 + 8)
+    # On 2 tasks with 3 seeds: own settings, 2 betas in 2 profiles, unscaled, I_c, 3 forms, numbers.
+    assert counts["pybullet-ablations"] == 2 * 3 * (4 + 2 + 4 + 4 + 1 + 3 + 4 * 3 + 3)
+    assert counts["pybullet-no-survival"] == 3 + 3 * 3 * (2 * 2 + 2 + 1 + 8)
+    names = {name: {run.name for run in runs} for name, runs in plans.items()}
+    # Own settings are run once for both studies.
+    assert len(names["pybullet"] & names["pybullet-ablations"]) == 2 * 3 * (4 + 2)
+
+
+def test_experts_go_first(study):
+    name = study("groups: [{label: a, recipe: fake.py}, {label: b, recipe: expert}]")
+    assert [run.goes_first for run in plan(name)] == [False, True]
