@@ -65,9 +65,9 @@ class Ablation:
 
 ABLATIONS = (
     Ablation("beta", "β, the weight of the true action", ("reward.beta",), ("giril",)),
-    Ablation("standardisation", "With and without standardised rewards", ("scaling.enabled",)),
+    Ablation("standardisation", "with and without standardised rewards", ("scaling.enabled",)),
     Ablation("information", "I_c, the information constraint", ("reward.information",), ("vail",)),
-    Ablation("form", "Form of the reward r_t", ("reward.form",)),
-    Ablation("demonstrations", "Number of demonstrations", ("demo.length", "demo.episodes")),
+    Ablation("form", "form of the reward r_t", ("reward.form",)),
+    Ablation("demonstrations", "number of demonstrations", ("demo.length", "demo.episodes")),
 )
 ABLATION_KEYS = frozenset(key for ablation in ABLATIONS for key in ablation.keys)

@@ -18,6 +18,7 @@ from giril_rl.report.style import DEMONSTRATION, EXPERT, PALETTE, Look, look
 from giril_rl.report.tables import Table
 
 BINS = 50
+LEGEND = 70  # characters in a line of a legend
 
 
 def binned_curve(
@@ -68,12 +69,15 @@ def row_curves(row: Row, bins: int = BINS) -> tuple[np.ndarray, np.ndarray] | No
     return ((np.arange(bins) + 1) * steps / bins)[kept], curves[:, kept]
 
 
-def draw_results(table: Table, path: Path) -> None:
+def draw_results(table: Table, path: Path) -> bool:
     """Write a task's picture: learned rewards on the left, controls on the right.
 
     Args:
         table: the task's table of results.
         path: the PNG file.
+
+    Returns:
+        Whether there was a curve to draw.
     """
     rows = _longest([line.row for line in table.lines if line.row.method != "expert"])
     parts = [
@@ -84,7 +88,7 @@ def draw_results(table: Table, path: Path) -> None:
         [look(row.method, row.profile, number) for number, row in enumerate(part)]
         for _, part in parts
     ]
-    _draw(
+    return _draw(
         table.panel,
         [
             (title, part, [row.name.removeprefix("control: ") for row in part], styles)
@@ -96,12 +100,15 @@ def draw_results(table: Table, path: Path) -> None:
     )
 
 
-def draw_varied(table: Table, path: Path) -> None:
+def draw_varied(table: Table, path: Path) -> bool:
     """Write an ablation's picture: a part for each method, a line for each value.
 
     Args:
         table: the ablation's table.
         path: the PNG file.
+
+    Returns:
+        Whether there was a curve to draw.
     """
     names = list(dict.fromkeys(line.row.name for line in table.lines))
     parts = []
@@ -111,8 +118,15 @@ def draw_varied(table: Table, path: Path) -> None:
             Look(PALETTE[i % len(PALETTE)], "-" if i < len(PALETTE) else "--")
             for i in range(len(lines))
         ]
-        parts.append((name, [line.row for line in lines], [line.value for line in lines], styles))
-    _draw(table.panel, parts, [line.row for line in table.lines], path, about=table.title)
+        values = [line.value for line in lines]
+        labels = [
+            f"{line.value}, {line.row.steps:,} steps"
+            if values.count(line.value) > 1
+            else line.value
+            for line in lines
+        ]
+        parts.append((name, [line.row for line in lines], labels, styles))
+    return _draw(table.panel, parts, [line.row for line in table.lines], path, about=table.title)
 
 
 def _longest(rows: Sequence[Row]) -> list[Row]:
@@ -130,41 +144,31 @@ def _draw(
     rows: Sequence[Row],
     path: Path,
     about: str = "",
-) -> None:
+) -> bool:
+    curves = {id(row): row_curves(row) for row in rows}
+    if not any(curves.values()):
+        return False
     columns = 2 if len(parts) == 4 else min(len(parts), 3)
     lines = -(-len(parts) // columns)
     longest = max(len(label) for _, _, labels, _ in parts for label in labels)
     ncols = 1 if longest > 36 else 2
-    entries = max(len(part) for _, part, _, _ in parts) + 2
+    entries = max(sum(len(wrap(x, LEGEND)) for x in labels) for _, _, labels, _ in parts) + 2
     figure = new_figure(6.2 * columns, (4.6 + 0.2 * -(-entries // ncols)) * lines + 0.4)
     grid = figure.subplots(lines, columns, squeeze=False, sharey=True, sharex=True).flatten()
     for axes, (title, part, labels, styles) in zip(grid, parts, strict=False):
         for row, label, style in zip(part, labels, styles, strict=True):
-            _line(axes, row, label, style)
-        for who, color, linestyle, width in (
-            ("expert", EXPERT, (0, (6, 3)), 1.0),
-            ("demo", DEMONSTRATION, (0, (1, 1)), 2.2),
-        ):
-            value = panel.reference(who)
-            if value is not None:
-                name = "demonstration" if who == "demo" else who
-                axes.axhline(
-                    value,
-                    color=color,
-                    linestyle=linestyle,
-                    linewidth=width,
-                    label=f"{name} ({value:,.1f})",
-                    zorder=1,
-                )
+            _line(axes, row, curves[id(row)], label, style)
+        _references(axes, panel)
         axes.set_title(title)
         axes.set_xlabel("environment steps")
-        axes.set_xlim(left=0)
         axes.tick_params(labelbottom=True, labelleft=True)
         thousands(axes.xaxis)
         thousands(axes.yaxis)
         axes.grid(alpha=0.3)
         # Below the axes: nothing of a curve is covered.
         axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=ncols, fontsize=8)
+    # Once all are drawn: the axes share their limits.
+    grid[0].set_xlim(0, 1.05 * max(row.trained_steps[-1] for row in rows))
     for axes in grid[::columns]:
         axes.set_ylabel("true return of training episodes")
     for axes in grid[len(parts) :]:
@@ -174,11 +178,30 @@ def _draw(
     room = 72 * columns
     figure.suptitle("\n".join([*wrap(title, room), *wrap(caption, room)]), fontsize=11)
     save(figure, path)
+    return True
 
 
-def _line(axes: Any, row: Row, label: str, style: Look) -> None:
-    label = f"{label}, n = {len(row.runs)}"
-    found = row_curves(row)
+def _references(axes: Any, panel: Panel) -> None:
+    for who, color, linestyle, width in (
+        ("expert", EXPERT, (0, (6, 3)), 1.0),
+        ("demonstration", DEMONSTRATION, (0, (1, 1)), 2.2),
+    ):
+        value = panel.reference("demo" if who == "demonstration" else who)
+        if value is not None:
+            axes.axhline(
+                value,
+                color=color,
+                linestyle=linestyle,
+                linewidth=width,
+                label=f"{who} ({value:,.1f})",
+                zorder=1,
+            )
+
+
+def _line(
+    axes: Any, row: Row, found: tuple[np.ndarray, np.ndarray] | None, label: str, style: Look
+) -> None:
+    label = "\n".join(wrap(f"{label}, n = {len(row.runs)}", LEGEND))
     if found is None:
         axes.axhline(
             row.estimates[0].value,

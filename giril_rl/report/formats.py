@@ -95,7 +95,8 @@ def budget_text(rows: Iterable[Row]) -> str:
         'no environment steps'
     """
     budgets = sorted({row.steps for row in rows if row.is_trained and row.method != "expert"})
-    return f"{' and '.join(f'{steps:,}' for steps in budgets) or 'no'} environment steps"
+    texts = [f"{steps:,}" for steps in budgets] or ["no"]
+    return f"{' and '.join(filter(None, [', '.join(texts[:-1]), texts[-1]]))} environment steps"
 
 
 def markdown(table: Table) -> str:

@@ -91,24 +91,19 @@ def _head(runs: Sequence[RunRecord], unfinished: Sequence[Unfinished]) -> str:
 
 
 def _section(table: Table, out: Path) -> str:
-    panel, rows = table.panel, [line.row for line in table.lines]
+    panel = table.panel
     heading = "##" if table.name == "results" else "###"
-    text = [f"{heading} {panel.title}: {table.title[0].lower()}{table.title[1:]}\n"]
+    text = [f"{heading} {panel.title}: {table.title}\n"]
     text += [_caption(table), markdown(table)]
     name = f"curves-{safe(panel.title.replace(', ', '-'))}"
     if table.name == "results":
-        trained = [row for row in rows if row.method != "expert"]
-        if trained:
-            draw_results(table, out / f"{name}.png")
-            text.append(_picture(f"{name}.png", f"learning curves, {panel.title}"))
+        drawn = draw_results(table, out / f"{name}.png")
     else:
-        draw_varied(table, out / f"{name}-{table.name}.png")
-        text.append(_picture(f"{name}-{table.name}.png", f"{table.title}, {panel.title}"))
+        name += f"-{table.name}"
+        drawn = draw_varied(table, out / f"{name}.png")
+    if drawn:
+        text.append(f"![{table.title}, {panel.title}]({name}.png)\n")
     return "\n".join(text)
-
-
-def _picture(file: str, words: str) -> str:
-    return f"![{words}]({file})\n"
 
 
 def _caption(table: Table) -> str:

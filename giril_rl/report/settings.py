@@ -103,11 +103,17 @@ def _usual(runs: Iterable[RunRecord]) -> dict[tuple[str, str], dict[str, Any]]:
 def split_task(changes: Changes) -> tuple[Changes, Changes]:
     """The changes that make the task another one, and the others.
 
+    How long an expert is trained is none of the task's.
+
     Examples:
         >>> split_task((("ppo.lr", "0.1"), ("task.horizon", "fixed"), ("termination", "bootstrap")))
         ((('task.horizon', 'fixed'), ('termination', 'bootstrap')), (('ppo.lr', '0.1'),))
     """
-    of_task = tuple(c for c in changes if c[0].startswith("task.") or c[0] == "termination")
+    of_task = tuple(
+        (key, value)
+        for key, value in changes
+        if key == "termination" or (key.startswith("task.") and not key.startswith("task.expert_"))
+    )
     return of_task, tuple(c for c in changes if c not in of_task)
 
 

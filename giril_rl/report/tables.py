@@ -62,7 +62,7 @@ def tables_of(panel: Panel) -> list[Table]:
 
 def _results(panel: Panel) -> Table:
     lines = [Line(panel, row, "", _figure(panel, row, "results")) for row in panel.main]
-    return Table("results", "Results", panel, lines)
+    return Table("results", "results", panel, lines)
 
 
 def _ablation(panel: Panel, about: Ablation) -> Table:
@@ -85,7 +85,7 @@ def _others(panel: Panel) -> Table:
         Line(panel, row, row.settings or "the recipe's own", None)
         for row in _beside_their_own(panel, varied)
     ]
-    return Table("other", "Other settings", panel, lines)
+    return Table("other", "other settings", panel, lines)
 
 
 def _beside_their_own(panel: Panel, varied: Sequence[Row]) -> list[Row]:

@@ -123,7 +123,10 @@ def execute(study: StudyFolder, launcher: Launcher, settings: StudyConfig) -> No
             if changed:
                 study.write_status()
             if signals.count > told:
-                (launcher.interrupt if told == 0 else launcher.kill)()
+                if told == 0:
+                    launcher.interrupt()
+                if signals.count > 1:
+                    launcher.kill()
                 told = signals.count
             bar.update(0, running=len(running), failed=study.count("failed"))
             time.sleep(PAUSE)

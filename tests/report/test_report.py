@@ -97,6 +97,13 @@ def test_all_tasks_together(made, capsys):
     assert "Not on every task, and so not here: control: constant." in text
 
 
+def test_without_training_episodes_there_are_no_curves(made, capsys):
+    made("bc", score=300.0)
+    out, _ = report(made, capsys)
+    assert [path.name for path in out.glob("*.png")] == ["normalised.png"]
+    assert "| BC | 1 | 0 | 300.0 |" in (out / "report.md").read_text()
+
+
 def test_a_demonstration_without_a_positive_score_has_no_bars(made, capsys):
     made("giril", score=-5.0, demo_return_mean=-2.0)
     out, _ = report(made, capsys)
@@ -164,14 +171,20 @@ def test_curves_of_a_row(runs):
     assert row_curves(rows["BC", ""]) is None
 
 
-def test_the_legend_covers_no_curve(runs, monkeypatch, tmp_path):
+@pytest.fixture
+def drawn(monkeypatch):
+    """The figures that are saved."""
     from matplotlib.figure import Figure
 
-    drawn = []
+    figures = []
     savefig = Figure.savefig
     monkeypatch.setattr(
-        Figure, "savefig", lambda self, *a, **k: (savefig(self, *a, **k), drawn.append(self))
+        Figure, "savefig", lambda self, *a, **k: (savefig(self, *a, **k), figures.append(self))
     )
+    return figures
+
+
+def test_the_legend_covers_no_curve(runs, drawn, tmp_path):
     assert main(["report", str(runs.root), "--out", str(tmp_path / "out")]) == 0
     legends = [
         ([text.get_text() for text in legend.get_texts()], legend, axes)
@@ -184,3 +197,18 @@ def test_the_legend_covers_no_curve(runs, monkeypatch, tmp_path):
         assert legend.get_window_extent().y1 <= axes.get_window_extent().y0
         assert any(name.startswith("demonstration (") for name in names)
     assert ["GIRIL (released), n = 3", "BC, n = 3 (final score)"] in [n[:2] for n, _, _ in legends]
+
+
+def test_no_curve_is_cut_off(made, drawn, tmp_path):
+    made("giril", score=1.0)
+    made("giril", "reward.prior=conditional", score=1.0)
+    made("giril", "reward.prior=conditional", "steps=2000000", score=1.0)
+    made("control", "steps=1000000", score=1.0)
+    assert main(["report", str(made.root), "--out", str(tmp_path / "out")]) == 0
+    limits = [[axes.get_xlim()[1] for axes in figure.axes] for figure in drawn[1:]]
+    assert limits == [[1_050_000, 1_050_000], [2_100_000]]
+    labels = [text.get_text() for text in drawn[2].axes[0].get_legend().get_texts()]
+    assert labels[1:3] == [
+        "reward.prior=conditional, 300,000 steps, n = 1",
+        "reward.prior=conditional, 2,000,000 steps, n = 1",
+    ]

@@ -94,6 +94,13 @@ def test_what_changes_the_task_makes_a_panel_without_the_papers_numbers(made):
     assert list(papers.values()) == [[None], [990.2], [None]]
 
 
+def test_how_long_an_expert_trains_makes_no_other_task(made):
+    made("giril", "task.expert_steps=2000000", score=1.0)
+    made("giril", "task.expert_score=900", score=2.0)
+    found = {row.settings.split()[-1] for row in rows(made).values()}
+    assert found == {"task.expert_steps=2000000", "task.expert_score=900.0"}
+
+
 def test_a_key_that_a_run_was_made_without_is_no_difference(made):
     folder = made("giril", score=1.0)
     config = yaml.safe_load((folder / "config.yaml").read_text())

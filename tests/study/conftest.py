@@ -21,10 +21,12 @@ from giril_rl.configs import RunConfig, knob
 from giril_rl.errors import UserError
 from giril_rl.naming import config_hash
 
+HOW = ("well", "user", "bug", "once", "killed", "slow", "stubborn")
+
 
 @dataclass
 class Config(RunConfig):
-    how: str = knob("well", "how to end", choices=("well", "user", "bug", "once", "killed", "slow"))
+    how: str = knob("well", "how to end", choices=HOW)
     widths: list[int] = knob([4], "a knob that is a list", low=1)
 
 
@@ -39,11 +41,15 @@ def main(cfg: Config, out: Path) -> None:
         raise RuntimeError("boom")
     if cfg.how == "killed" or (cfg.how == "once" and (out / "began").read_text() == "x"):
         os.kill(os.getpid(), signal.SIGKILL)
-    if cfg.how == "slow" and not (out / "saved").exists():
+    if cfg.how in ("slow", "stubborn") and not (out / "saved").exists():
         try:
+            (out / "ready").touch()
             time.sleep(60)
         except KeyboardInterrupt:
-            (out / "saved").write_text("x")
+            (out / "told").touch()
+            if cfg.how == "stubborn":
+                time.sleep(60)
+            (out / "saved").touch()
             raise
     (out / "result.json").write_text(json.dumps({"config_hash": config_hash(cfg)}))
     # What prints the scores imports torch, which takes far longer than the rest.
