@@ -15,7 +15,7 @@ from giril_rl.cli import main
 
 STUDY = """
 all:
-  {task: inverted_pendulum, logger: null, eval.episodes: 1, steps: 24_000,
+  {task: inverted_pendulum, logger: null, eval.episodes: 1, steps: 25_600,
    ppo: {num_envs: 2, rollout: 64, minibatch: 64, epochs: 1, hidden: [16], checkpoint_every: 640}}
 groups: [{label: a, recipe: control, seed: [0, 1]}]
 """
