@@ -1,8 +1,11 @@
 """A recipe that takes no time, for studies of many runs."""
 
+import sys
 from pathlib import Path
 
 import pytest
+
+from giril_rl.training import finished
 
 RECIPE = '''"""Fake: a result after no work; `how` says how to fail."""
 
@@ -71,6 +74,8 @@ steps: ${task.steps}
 def study(tmp_path, monkeypatch):
     """Writes a study of the fake recipe into an empty working directory; its file's name."""
     monkeypatch.chdir(tmp_path)
+    # The fake recipe puts another module in this one's place; in this process only for one test.
+    monkeypatch.setitem(sys.modules, finished.__name__, finished)
     monkeypatch.setattr("giril_rl.study.execute.PAUSE", 0.01)
     Path("fake.py").write_text(RECIPE)
     Path("fake.yaml").write_text(SETTINGS)
