@@ -39,7 +39,7 @@ def main(cfg: Config, out: Path) -> None:
         check_inputs(cfg, cfg.expert, cfg.demo)
     else:
         gym_factory(cfg.task)  # Refuses an unknown environment before a folder is made.
-    player = RandomPolicy.of_task(cfg.task) if cfg.reward == "random" else None
+    player = RandomPolicy.of_task(cfg.task, cfg.seed) if cfg.reward == "random" else None
     with Run.open(out, asdict(cfg), recipe="control", logger=cfg.logger) as run:
         if run.finished:
             return

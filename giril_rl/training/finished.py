@@ -63,10 +63,13 @@ def evaluate_run(folder: Path, episodes: int | None = None, seed: int | None = N
     Raises:
         UserError: if the folder holds no finished run.
     """
-    method = read_result(folder)["method"]
+    result = read_result(folder)
     task, ppo, settings = read_settings(folder)
     agent: Player
-    agent = RandomPolicy.of_task(task) if method == RANDOM else load_agent(folder, task, ppo)
+    if result["method"] == RANDOM:
+        agent = RandomPolicy.of_task(task, result["seed"])
+    else:
+        agent = load_agent(folder, task, ppo)
     episodes = settings.episodes if episodes is None else episodes
     seed = settings.seed if seed is None else seed
     scores = evaluate_both(agent, task, episodes=episodes, seed=seed)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.data import TensorSpec, Unbounded
@@ -15,10 +16,14 @@ RANDOM = "control:random"
 
 
 class RandomPolicy(TensorDictModuleBase):
-    """Draws actions uniformly from the action space, with torch's global generator.
+    """Draws actions uniformly from the action space.
+
+    The actions are a stream of their own: torch's global generator is neither read nor moved, so
+    that policies of two seeds differ where evaluation seeds the global generator alike.
 
     Args:
         action_spec: the spec of a batched environment, whose first dimension is dropped.
+        seed: of the actions.
 
     Raises:
         UserError: for actions without bounds, which have no uniform distribution.
@@ -33,7 +38,7 @@ class RandomPolicy(TensorDictModuleBase):
         (torch.Size([5, 1]), True)
     """
 
-    def __init__(self, action_spec: TensorSpec) -> None:
+    def __init__(self, action_spec: TensorSpec, seed: int = 0) -> None:
         super().__init__()
         if isinstance(action_spec, Unbounded):
             raise UserError(
@@ -42,19 +47,25 @@ class RandomPolicy(TensorDictModuleBase):
             )
         self.in_keys: list[str] = []
         self.out_keys = ["action"]
-        self.spec = action_spec[0]
+        self.action_spec = action_spec
+        self.seed = seed
+        self._stream = torch.Generator().manual_seed(seed).get_state()
 
     @classmethod
-    def of_task(cls, task: TaskConfig) -> RandomPolicy:
+    def of_task(cls, task: TaskConfig, seed: int = 0) -> RandomPolicy:
         """The random policy of a task's action space."""
         env = make_env(task, 1, seed=0)
         env.close()
-        return cls(env.action_spec)
+        return cls(env.action_spec, seed)
 
     def acting(self) -> RandomPolicy:
-        """Itself: what an agent's method of this name gives to an environment."""
-        return self
+        """The same policy from its first action on."""
+        return RandomPolicy(self.action_spec, self.seed)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes an action for each element of the batch."""
-        return tensordict.set("action", self.spec.rand(tensordict.batch_size))
+        with torch.random.fork_rng(devices=[]):  # Specs draw from the global generator alone.
+            torch.set_rng_state(self._stream)
+            action = self.action_spec[0].rand(tensordict.batch_size)
+            self._stream = torch.get_rng_state()
+        return tensordict.set("action", action)

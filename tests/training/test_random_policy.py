@@ -61,3 +61,23 @@ def test_evaluation_seeds_decide_its_score():
         for seed, deterministic in ((0, False), (0, True), (1, False))
     )
     assert one == two != other
+
+
+def test_two_seeds_are_two_policies_in_the_same_episodes():
+    """Evaluation draws the same episodes for every run: five seeds must not be one result."""
+    one, again, other = (
+        evaluate(
+            RandomPolicy.of_task(CARTPOLE, seed), CARTPOLE, episodes=5, seed=0, deterministic=False
+        ).returns
+        for seed in (0, 0, 1)
+    )
+    assert one == again != other
+
+
+def test_leaves_the_global_generator_alone():
+    state = torch.get_rng_state()
+    policy = RandomPolicy(Categorical(3, shape=(2,)))
+    first, second = (policy(TensorDict(batch_size=[50]))["action"] for _ in range(2))
+    assert torch.equal(torch.get_rng_state(), state)
+    assert not torch.equal(first, second)
+    assert torch.equal(policy.acting()(TensorDict(batch_size=[50]))["action"], first)
