@@ -72,7 +72,9 @@ class Planner:
         self._composed: dict[tuple[str, ...], tuple[Any, dict[str, str], tuple[str, ...]]] = {}
 
     def plan(self, spec: Spec, changes: Sequence[str] = ()) -> list[StudyRun]:
-        """All runs of ``spec``.
+        """All runs of ``spec``, those of the lowest seed first.
+
+        A study that is cut short then has a few seeds of every row, not every seed of a few rows.
 
         Args:
             spec: the study.
@@ -101,7 +103,7 @@ class Planner:
                     f"folder {run.folder}: rename one of their files."
                 )
             _check_finished(run)
-        return list(runs.values())
+        return sorted(runs.values(), key=lambda run: run.config.seed)
 
     def _runs(self, group: Group, word: str, changes: Sequence[str]) -> list[StudyRun]:
         from giril_rl.overrides import sweep

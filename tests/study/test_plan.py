@@ -71,10 +71,19 @@ def test_the_command_line_takes_the_place_of_every_groups_own(study):
     runs = plan(name, "seed=5,6", "ppo.lr=0.5")
     assert [(run.label, run.config.seed, run.config.ppo.lr) for run in runs] == [
         ("a", 5, 0.5),
-        ("a", 6, 0.5),
         ("b", 5, 0.5),
+        ("a", 6, 0.5),
         ("b", 6, 0.5),
     ]
+
+
+def test_a_study_that_is_cut_short_has_every_row_of_the_first_seed(study):
+    name = study(
+        "groups: [{label: a, recipe: fake.py, seed: [0, 1]},"
+        " {label: b, recipe: fake.py, how: bug, seed: [1, 0]}]"
+    )
+    order = [(run.config.seed, run.label) for run in plan(name)]
+    assert order == [(0, "a"), (0, "b"), (1, "a"), (1, "b")]
 
 
 @pytest.mark.parametrize(
