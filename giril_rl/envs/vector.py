@@ -10,15 +10,15 @@ import gymnasium
 import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torchrl.data import Bounded, Categorical, Composite, Unbounded
-from torchrl.envs import EnvBase
+from torchrl.data import Bounded, Unbounded
 
+from giril_rl.envs.batched import NOT_REPEATING, BatchedEnv
 from giril_rl.envs.spaces import action_spec, without_bookkeeping
 from giril_rl.envs.stdout import silent_stdout
 from giril_rl.errors import UserError
 
 
-class GymVectorEnv(EnvBase):
+class GymVectorEnv(BatchedEnv):
     """``num_envs`` copies of a Gymnasium environment stepped as one TorchRL environment.
 
     ``("next", "observation")`` at an episode's end is the true terminal observation; the reset
@@ -52,9 +52,6 @@ class GymVectorEnv(EnvBase):
         torch.Size([4, 10, 4])
     """
 
-    _onward_key = "observation"
-    """Entry of ``next`` from which a copy goes on whose episode has not ended."""
-
     def __init__(
         self,
         make_fn: Callable[[], gymnasium.Env],
@@ -63,8 +60,7 @@ class GymVectorEnv(EnvBase):
         seed: int = 0,
         max_episode_steps: int | None = None,
     ) -> None:
-        super().__init__(device=None, batch_size=[num_envs])
-        self._make_fn = make_fn
+        super().__init__(num_envs, seed=seed)
         self._gym_envs: list[gymnasium.Env] = []
         self._limit = max_episode_steps
         with silent_stdout():
@@ -72,12 +68,8 @@ class GymVectorEnv(EnvBase):
                 env, limit = without_bookkeeping(make_fn())
                 self._limit = self._limit or limit
                 self._gym_envs.append(env)
-        self.is_closed = False  # EnvBase says True where no wrapper says otherwise.
-        self._root_seed = seed
-        self._episode = np.zeros(num_envs, dtype=np.int64)
         self._steps = np.zeros(num_envs, dtype=np.int64)
         self._started = False
-        self._restored = False
         self._actions: list[np.ndarray] = []
         self._last_observation = np.zeros((num_envs, 0), dtype=np.float32)
         self._make_specs(self._gym_envs[0])
@@ -91,19 +83,11 @@ class GymVectorEnv(EnvBase):
                 "(one-dimensional Box) observation."
             )
         n = self.batch_size[0]
-        self.observation_spec = Composite(
-            observation=Unbounded((n, *observation.shape), dtype=torch.float32), shape=(n,)
-        )
-        self.action_spec = action_spec(action, n, name)
-        bounded = isinstance(self.action_spec, Bounded)
+        actions = action_spec(action, n, name)
+        bounded = isinstance(actions, Bounded)
         self._bounds = (action.low, action.high) if bounded else None  # type: ignore[attr-defined]
-        self.reward_spec = Unbounded((n, 1), dtype=torch.float32)
-        flag = Categorical(2, shape=(n, 1), dtype=torch.bool)
-        self.done_spec = Composite(
-            done=flag.clone(), terminated=flag.clone(), truncated=flag.clone(), shape=(n,)
-        )
+        self._declare(Unbounded((n, *observation.shape), dtype=torch.float32), actions)
         self._last_observation = np.zeros((n, *observation.shape), dtype=np.float32)
-        self._false = torch.zeros(n, 1, dtype=torch.bool)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         # A copy, for the caller may reuse its memory and the history may not change.
@@ -136,47 +120,6 @@ class GymVectorEnv(EnvBase):
             batch_size=self.batch_size,
         )
 
-    def step_and_maybe_reset(
-        self, tensordict: TensorDictBase
-    ) -> tuple[TensorDictBase, TensorDictBase]:
-        """Steps all copies and resets those whose episode ended.
-
-        The same as :meth:`torchrl.envs.EnvBase.step_and_maybe_reset` without its general
-        bookkeeping, which costs more than these simulators do.
-        """
-        following = self._step(tensordict)
-        tensordict.set("next", following)
-        done = following.get("done")
-        if done.any():
-            observation = torch.from_numpy(self._reset_where(done.view(-1).numpy()))
-        else:
-            observation = following.get(self._onward_key)
-        return tensordict, self._root(observation)
-
-    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
-        mask = None if tensordict is None else tensordict.get("_reset", None)
-        if self._restored:
-            # A restored simulator stands in the middle of its episodes: the first reset after
-            # that hands out where it stands.
-            self._restored = False
-            return self._root(torch.from_numpy(self._last_observation.copy()))
-        if mask is None:
-            selected = np.ones(len(self._gym_envs), dtype=bool)
-        else:
-            selected = mask.view(-1).numpy()
-        return self._root(torch.from_numpy(self._reset_where(selected)))
-
-    def _root(self, observation: torch.Tensor) -> TensorDictBase:
-        return TensorDict(
-            {
-                "observation": observation,
-                "done": self._false,
-                "terminated": self._false,
-                "truncated": self._false,
-            },
-            batch_size=self.batch_size,
-        )
-
     def _reset_where(self, mask: np.ndarray) -> np.ndarray:
         self._steps[mask] = 0
         return self._restart(mask)
@@ -196,14 +139,6 @@ class GymVectorEnv(EnvBase):
     def _replayed(self) -> np.ndarray:
         """How many actions lead each copy from its simulator's last reset to where it stands."""
         return self._steps
-
-    def _episode_seed(self, index: int) -> int:
-        entropy = [self._root_seed, index, int(self._episode[index])]
-        return int(np.random.SeedSequence(entropy).generate_state(1)[0])
-
-    def _set_seed(self, seed: int | None) -> None:
-        self._root_seed = 0 if seed is None else seed
-        self._episode[:] = 0
 
     def simulator_state(self) -> dict[str, Any]:
         """What :meth:`restore_simulator` needs to bring another instance to this very moment.
@@ -247,10 +182,7 @@ class GymVectorEnv(EnvBase):
                 for action in actions[len(actions) - steps[i] :]:
                     observation[i] = env.step(action[i])[0]
         if not np.array_equal(observation, state["observation"].numpy()):
-            raise UserError(
-                "the simulator does not repeat itself for equal seeds and actions, so that this "
-                "run cannot be continued: start it again in another folder (out=...)."
-            )
+            raise UserError(NOT_REPEATING)
         self._last_observation = observation
         self._started = self._restored = True
 
