@@ -1,0 +1,224 @@
+"""Atari games as one TorchRL environment, whose episodes are lives or whole games."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torchrl.data import Bounded, Categorical
+
+from giril_rl.envs.atari_game import FRAME_CAP, NOOP, SIDE, AtariGame, Shown
+from giril_rl.envs.batched import NOT_REPEATING, BatchedEnv
+from giril_rl.errors import UserError
+
+Episode = Literal["life", "game"]
+
+STACK = 4
+
+
+class AtariEnv(BatchedEnv):
+    """``num_envs`` games of DeepMind's preprocessing, see :class:`AtariGame`, four frames stacked.
+
+    With ``episode="life"`` a lost life ends the learner's episode (``terminated``) and the game
+    goes on from there; ``("next", "observation")`` is then the last stack of that life. With
+    ``episode="game"`` only the game's end does, as scores are counted; where a life is lost in the
+    middle, ``("next", "observation")`` is the first of the next life.
+
+    A life begins, as with the wrappers of OpenAI baselines, with a step without action (but for a
+    game's first life) and, in games that have the button, the actions 1 (fire) and 2. The stack is
+    then empty, black, but for the latest frame. What these steps score counts in whole games and is
+    lost to the learner of single lives.
+
+    Observations are uint8 ``(num_envs, 4, 84, 84)``, the latest frame last; actions are integers.
+    ``("next", "game_over")`` tells the end of a game from that of a life.
+
+    Args:
+        game: the ROM's name in ale-py, such as ``"breakout"``.
+        num_envs: number of games.
+        episode: "life" or "game".
+        seed: root of the games' seeds.
+        frame_cap: emulated frames after which a game is cut (truncated).
+
+    Raises:
+        UserError: if ale-py is not installed or has no such game.
+
+    Examples:
+        >>> env = AtariEnv("breakout", num_envs=2)
+        >>> batch = env.rollout(5)
+        >>> batch["next", "observation"].shape, batch["next", "observation"].dtype
+        (torch.Size([2, 5, 4, 84, 84]), torch.uint8)
+    """
+
+    def __init__(
+        self,
+        game: str,
+        num_envs: int,
+        *,
+        episode: Episode = "life",
+        seed: int = 0,
+        frame_cap: int = FRAME_CAP,
+    ) -> None:
+        if episode not in ("life", "game"):
+            raise UserError(f"task.episode={episode}: choose one of life, game.")
+        super().__init__(num_envs, seed=seed)
+        self._games = [AtariGame(game, frame_cap) for _ in range(num_envs)]
+        self._lives_end = episode == "life"
+        self._opening = [1, 2] if self._games[0].fires else []
+        self._lives = np.zeros(num_envs, dtype=np.int64)
+        self._between = np.zeros(num_envs, dtype=bool)  # A life was lost and the game goes on.
+        self._actions: list[list[int]] = [[] for _ in range(num_envs)]  # Since a game's reset.
+        self._last_observation = np.zeros((num_envs, STACK, SIDE, SIDE), dtype=np.uint8)
+        shape = (num_envs, STACK, SIDE, SIDE)
+        self._declare(
+            Bounded(0, 255, shape=shape, dtype=torch.uint8),
+            Categorical(len(self._games[0].meanings), shape=(num_envs,), dtype=torch.int64),
+        )
+        self.observation_spec["game_over"] = Categorical(2, shape=(num_envs, 1), dtype=torch.bool)
+
+    @property
+    def lives(self) -> np.ndarray:
+        """Lives left in each game, int64 ``(num_envs,)``."""
+        return self._lives.copy()
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        everyone = range(len(self._games))
+        shown = self._play(everyone, tensordict.get("action").tolist())
+        stack = np.empty_like(self._last_observation)
+        stack[:, :-1] = self._last_observation[:, 1:]
+        for i, game in enumerate(shown):
+            stack[i, -1] = game.frame
+        self._last_observation = stack
+        reward = np.array([game.reward for game in shown], dtype=np.float32)
+        over = np.array([game.over for game in shown])
+        cut = np.array([game.cut for game in shown]) & ~over
+        lives = np.array([game.lives for game in shown], dtype=np.int64)
+        # In some games a lost last life shows before the game is over (Qbert).
+        self._between = (lives < self._lives) & (lives > 0) & ~over & ~cut
+        self._lives = lives
+        terminated = over | self._between if self._lives_end else over
+        if not self._lives_end and self._between.any():
+            scored, ended = self._begin_lives(np.flatnonzero(self._between).tolist())
+            reward += scored
+            over = terminated = over | ended
+            self._between[:] = False
+        return TensorDict(
+            {
+                "observation": torch.from_numpy(self._last_observation),
+                "reward": torch.from_numpy(reward).unsqueeze(-1),
+                "done": torch.from_numpy(terminated | cut).unsqueeze(-1),
+                "terminated": torch.from_numpy(terminated).unsqueeze(-1),
+                "truncated": torch.from_numpy(cut).unsqueeze(-1),
+                "game_over": torch.from_numpy(over | cut).unsqueeze(-1),
+            },
+            batch_size=self.batch_size,
+        )
+
+    def _play(self, indices: Sequence[int], actions: Sequence[int]) -> list[Shown]:
+        """One step of some games, at the same time."""
+        for i, action in zip(indices, actions, strict=True):
+            self._games[i].send(action)
+            self._actions[i].append(action)
+        return [self._games[i].receive() for i in indices]
+
+    def _root(self, observation: torch.Tensor) -> TensorDictBase:
+        return super()._root(observation).set("game_over", self._false)
+
+    def _reset_where(self, mask: np.ndarray) -> np.ndarray:
+        _, ended = self._begin_lives(np.flatnonzero(mask & self._between).tolist())
+        fresh = mask & ~self._between | ended
+        while fresh.any():  # The opening of a game may end it, if hardly ever.
+            fresh = self._begin_games(np.flatnonzero(fresh).tolist())
+        self._between[mask] = False
+        return self._last_observation
+
+    def _begin_games(self, indices: list[int]) -> np.ndarray:
+        frames = {}
+        for i in indices:
+            frames[i], self._lives[i] = self._games[i].reset(self._episode_seed(i))
+            self._episode[i] += 1
+            self._actions[i] = []
+        return self._open(indices, self._opening, frames)[1]
+
+    def _begin_lives(self, indices: list[int]) -> tuple[np.ndarray, np.ndarray]:
+        return self._open(indices, [NOOP, *self._opening], {})
+
+    def _open(
+        self, indices: list[int], actions: list[int], frames: dict[int, np.ndarray]
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Plays ``actions`` in some games and clears their stacks; what was scored, which ended."""
+        scored = np.zeros(len(self._games), dtype=np.float32)
+        ended = np.zeros(len(self._games), dtype=bool)
+        playing = list(indices)
+        for action in actions:
+            for i, shown in zip(playing, self._play(playing, [action] * len(playing)), strict=True):
+                frames[i], self._lives[i] = shown.frame, shown.lives
+                scored[i] += shown.reward
+                ended[i] = shown.over or shown.cut
+            playing = [i for i in playing if not ended[i]]
+        # What was handed out before stays as it is: a batch may hold it.
+        self._last_observation = self._last_observation.copy()
+        self._last_observation[indices] = 0
+        for i in indices:
+            self._last_observation[i, -1] = frames[i]
+        return scored, ended
+
+    def _set_seed(self, seed: int | None) -> None:
+        super()._set_seed(seed)
+        self._between[:] = False
+
+    def simulator_state(self) -> dict[str, Any]:
+        """What :meth:`restore_simulator` needs to bring another instance to this very moment.
+
+        Returns:
+            Tensors only: the games' numbers, the actions since each game began, int16 ``(num_envs,
+            longest)`` with -1 after the last, and what the learner sees.
+        """
+        longest = max(len(actions) for actions in self._actions)
+        actions = np.full((len(self._games), longest), -1, dtype=np.int16)
+        for row, own in zip(actions, self._actions, strict=True):
+            row[: len(own)] = own
+        return {
+            "seed": self._root_seed,
+            "episode": torch.from_numpy(self._episode.copy()),
+            "actions": torch.from_numpy(actions),
+            "lives": torch.from_numpy(self._lives.copy()),
+            "between": torch.from_numpy(self._between.copy()),
+            "observation": torch.from_numpy(self._last_observation.copy()),
+        }
+
+    def restore_simulator(self, state: dict[str, Any]) -> None:
+        """Replays the running games; the next :meth:`reset` hands out where they stand.
+
+        Args:
+            state: what :meth:`simulator_state` returned for an equal environment.
+
+        Raises:
+            UserError: if the replay ends elsewhere, which means that ale-py is another version.
+        """
+        self._root_seed = int(state["seed"])
+        self._episode = state["episode"].numpy().copy()
+        self._between = state["between"].numpy().copy()
+        self._lives = state["lives"].numpy().copy()
+        self._last_observation = state["observation"].numpy().copy()
+        actions = state["actions"].numpy()
+        frames, lives = np.zeros_like(self._last_observation[:, -1]), np.zeros_like(self._lives)
+        for i, game in enumerate(self._games):
+            self._episode[i] -= 1
+            frames[i], lives[i] = game.reset(self._episode_seed(i))
+            self._episode[i] += 1
+            self._actions[i] = []
+        for column in actions.T:
+            playing = np.flatnonzero(column >= 0).tolist()
+            for i, shown in zip(
+                playing, self._play(playing, column[playing].tolist()), strict=True
+            ):
+                frames[i], lives[i] = shown.frame, shown.lives
+        if not (
+            np.array_equal(frames, self._last_observation[:, -1])
+            and np.array_equal(lives, self._lives)
+        ):
+            raise UserError(NOT_REPEATING)
+        self._restored = True

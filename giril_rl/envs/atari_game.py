@@ -1,0 +1,113 @@
+"""One Atari game with the paper's preprocessing, steppable without waiting for it."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from giril_rl.errors import UserError
+from giril_rl.nearest import did_you_mean
+
+SIDE = 84
+NOOP = 0
+FRAME_CAP = 108_000
+"""Emulated frames after which a game is cut: half an hour of play, as in DeepMind's evaluation."""
+
+
+class Shown(NamedTuple):
+    """What a game shows after a step of four frames.
+
+    Attributes:
+        frame: grey, uint8 ``(84, 84)``.
+        reward: change of the score, unclipped.
+        over: the game is over.
+        cut: the frame cap was reached.
+        lives: lives left.
+    """
+
+    frame: np.ndarray
+    reward: float
+    over: bool
+    cut: bool
+    lives: int
+
+
+class AtariGame:
+    """An emulator in a thread of its own: :meth:`send` an action, :meth:`receive` what it shows.
+
+    Each action is repeated for four frames, of which the last two are maximised, turned grey and
+    brought to 84 x 84, by ale-py's vector environment. A game begins with 0 to 29 frames without
+    action, drawn from the seed. Actions are executed as given (no sticky actions), rewards are not
+    clipped, and nothing happens at a lost life: that is :class:`~giril_rl.envs.AtariEnv`'s matter.
+
+    One interface for each game rather than one for all: the steps that follow a lost life are taken
+    by that game alone, and the batch's order stays fixed. It costs about 4% of the steps a second.
+
+    Args:
+        game: the ROM's name in ale-py, such as ``"breakout"``.
+        frame_cap: emulated frames after which a game is cut.
+
+    Raises:
+        UserError: if ale-py is not installed or has no such game.
+
+    Examples:
+        >>> game = AtariGame("breakout")
+        >>> frame, lives = game.reset(seed=0)
+        >>> game.send(0)
+        >>> frame.shape, lives, game.receive().reward
+        ((84, 84), 5, 0.0)
+    """
+
+    def __init__(self, game: str, frame_cap: int = FRAME_CAP) -> None:
+        interface, path = _rom(game)
+        self._ale = interface(
+            rom_path=path,
+            num_envs=1,
+            stack_num=1,
+            use_fire_reset=False,
+            reward_clipping=False,
+            max_episode_steps=frame_cap,
+            num_threads=1,
+        )
+        self.meanings = [action.name for action in self._ale.get_action_set()]
+
+    @property
+    def fires(self) -> bool:
+        """Whether a life begins with a press of the button, as DeepMind's wrappers do it."""
+        return self.meanings[1] == "FIRE" and len(self.meanings) >= 3
+
+    def reset(self, seed: int) -> tuple[np.ndarray, int]:
+        """Begins a game; its first frame ``(84, 84)`` and its lives."""
+        shown, info = self._ale.reset([0], [seed & 0x7FFFFFFF])  # ale-py takes 31 bits.
+        return shown[0, 0], int(info["lives"][0])
+
+    def send(self, action: int) -> None:
+        """Lets the game play ``action`` for four frames."""
+        self._ale.send([action], [1.0])
+
+    def receive(self) -> Shown:
+        """Waits for what the last :meth:`send` led to."""
+        frame, reward, over, cut, info = self._ale.recv()
+        return Shown(
+            frame[0, 0], float(reward[0]), bool(over[0]), bool(cut[0]), int(info["lives"][0])
+        )
+
+    def play(self, action: int) -> Shown:
+        """:meth:`send` and :meth:`receive`."""
+        self.send(action)
+        return self.receive()
+
+
+def _rom(game: str) -> tuple[type, str]:
+    try:
+        from ale_py import ALEVectorInterface, roms
+    except ImportError:
+        raise UserError(
+            'Atari needs ale-py, which is not installed: pip install "giril-rl[atari]".'
+        ) from None
+    names = roms.get_all_rom_ids()
+    if game not in names:
+        hint = did_you_mean(game, names) or "; names are written as in space_invaders."
+        raise UserError(f"task.game={game} is not a game of ale-py{hint}")
+    return ALEVectorInterface, str(roms.get_rom_path(game))
