@@ -29,6 +29,7 @@ from giril_rl.rewards.generative_loss import (
 )
 from giril_rl.rewards.noise import NoiseReward
 from giril_rl.rewards.scaler import ObservationScaler, ScalingRule
+from giril_rl.rewards.transition_loss import TransitionLoss
 
 __all__ = [
     "ActionEncoder",
@@ -50,6 +51,7 @@ __all__ = [
     "Prior",
     "RewardForm",
     "ScalingRule",
+    "TransitionLoss",
     "action_term",
     "adversarial_reward",
     "blend_action",

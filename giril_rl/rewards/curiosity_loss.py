@@ -2,24 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Literal, get_args
 
-import torch
-from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.objectives import LossModule
 
 from giril_rl.errors import UserError
 from giril_rl.rewards.curiosity import CuriosityReward, feature_error
-from giril_rl.rewards.generative_loss import Reduction, action_term
+from giril_rl.rewards.generative_loss import action_term
+from giril_rl.rewards.transition_loss import Reduction, TransitionLoss
 
 FeatureTraining = Literal["inverse", "both", "none"]
 
 
-class CuriosityRewardLoss(LossModule):
+class CuriosityRewardLoss(TransitionLoss):
     """``L_I + L_F`` of the paper's appendix on CDIL, to be minimised.
 
     - ``loss_inverse``: how far the action that the inverse model reads from ``phi(s)`` and
@@ -44,6 +40,8 @@ class CuriosityRewardLoss(LossModule):
         UserError: for an unknown ``features`` or ``reduction``.
 
     Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
         >>> from torchrl.data import Bounded
         >>> reward = CuriosityReward.for_vectors(2, Bounded(-1, 1, shape=(1,)), normalise="raw")
         >>> loss = CuriosityRewardLoss(reward)
@@ -53,22 +51,6 @@ class CuriosityRewardLoss(LossModule):
         ['loss_forward', 'loss_inverse']
     """
 
-    @dataclass
-    class _AcceptedKeys:
-        """The keys that :meth:`set_keys` changes; their defaults are the reward's ``in_keys``.
-
-        Attributes:
-            observation: observation ``(*batch, d)``.
-            action: action, as the environment takes it.
-            next_observation: the true next observation.
-        """
-
-        observation: NestedKey = "observation"
-        action: NestedKey = "action"
-        next_observation: NestedKey = ("next", "observation")
-
-    default_keys = _AcceptedKeys
-    tensor_keys: _AcceptedKeys
     reward: CuriosityReward
 
     def __init__(
@@ -78,46 +60,20 @@ class CuriosityRewardLoss(LossModule):
         features: FeatureTraining = "inverse",
         reduction: Reduction = "mean",
     ) -> None:
-        super().__init__()
+        super().__init__(reward, reduction=reduction)
         if features not in get_args(FeatureTraining):
             raise UserError(f"features={features!r} is unknown: choose inverse, both or none.")
-        if reduction not in get_args(Reduction):
-            raise UserError(f"reduction={reduction!r} is unknown: choose mean, sum or none.")
-        self.reward = reward
         self.features: FeatureTraining = features
-        self.reduction = reduction
-        observation, action, following = reward.in_keys
-        self.set_keys(observation=observation, action=action, next_observation=following)
-
-    def _forward_value_estimator_keys(self, **kwargs: NestedKey) -> None:
-        pass
-
-    @property
-    def in_keys(self) -> list[NestedKey]:
-        """Keys of observation, action and next observation."""
-        keys = self.tensor_keys
-        return [keys.observation, keys.action, keys.next_observation]
 
     @property
     def out_keys(self) -> list[NestedKey]:
         """Names of the two terms."""
         return ["loss_inverse", "loss_forward"]
 
-    @dispatch
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """The two terms, reduced; with ``reduction="none"`` of the batch's shape."""
-        observation, action, following = (tensordict.get(key) for key in self.in_keys)
-        terms = self._terms(observation, action, following)
-        reduced = {
-            name: self._reduce_loss(term, tensordict=tensordict)
-            for name, term in zip(self.out_keys, terms, strict=True)
-        }
-        batch_size = tensordict.batch_size if self.reduction == "none" else []
-        return TensorDict._new_unsafe(reduced, torch.Size(batch_size))
-
-    def _terms(
+    def terms(
         self, observation: Tensor, action: Tensor, following: Tensor
     ) -> tuple[Tensor, Tensor]:
+        """The two terms, from which phi learns as ``features`` says."""
         reward = self.reward
         phi = reward.features(reward.scaler(observation))
         next_phi = reward.features(reward.scaler(following))

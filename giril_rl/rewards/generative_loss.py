@@ -2,21 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal, get_args
-
 import torch
 import torch.nn.functional as F
-from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.objectives import LossModule
 
 from giril_rl.errors import UserError
 from giril_rl.rewards.generative import GenerativeReward, reconstruction_error
-
-Reduction = Literal["mean", "sum", "none"]
+from giril_rl.rewards.transition_loss import Reduction, TransitionLoss
 
 
 def gaussian_kl(
@@ -68,7 +61,7 @@ def action_term(z: Tensor, action: Tensor) -> Tensor:
     return -F.log_softmax(z, -1).gather(-1, action.unsqueeze(-1)).squeeze(-1)
 
 
-class GenerativeRewardLoss(LossModule):
+class GenerativeRewardLoss(TransitionLoss):
     """The negative of eq. 1, in its three terms, whose sum is to be minimised.
 
     - ``loss_reconstruction``: lambda * squared norm of ``decoder(z, s) - s'``, with z itself, not
@@ -91,6 +84,7 @@ class GenerativeRewardLoss(LossModule):
         UserError: for an unknown reduction or a negative alpha.
 
     Examples:
+        >>> from tensordict import TensorDict
         >>> from torchrl.data import Bounded
         >>> reward = GenerativeReward.for_vectors(2, Bounded(-1, 1, shape=(1,)), normalise="raw")
         >>> loss = GenerativeRewardLoss(reward)
@@ -100,22 +94,6 @@ class GenerativeRewardLoss(LossModule):
         ['loss_action', 'loss_kl', 'loss_reconstruction']
     """
 
-    @dataclass
-    class _AcceptedKeys:
-        """The keys that :meth:`set_keys` changes; their defaults are the reward's ``in_keys``.
-
-        Attributes:
-            observation: observation ``(*batch, d)``.
-            action: action, as the environment takes it.
-            next_observation: the true next observation.
-        """
-
-        observation: NestedKey = "observation"
-        action: NestedKey = "action"
-        next_observation: NestedKey = ("next", "observation")
-
-    default_keys = _AcceptedKeys
-    tensor_keys: _AcceptedKeys
     reward: GenerativeReward
 
     def __init__(
@@ -125,48 +103,22 @@ class GenerativeRewardLoss(LossModule):
         alpha: float | None = None,
         reduction: Reduction = "mean",
     ) -> None:
-        super().__init__()
-        if reduction not in get_args(Reduction):
-            raise UserError(f"reduction={reduction!r} is unknown: choose mean, sum or none.")
+        super().__init__(reward, reduction=reduction)
         if alpha is None:
             alpha = 100.0 if reward.actions.discrete else 1.0
         if not alpha >= 0:
             raise UserError(f"alpha={alpha} is negative: give a weight of 0 or more.")
-        self.reward = reward
         self.alpha = alpha
-        self.reduction = reduction
-        observation, action, following = reward.in_keys
-        self.set_keys(observation=observation, action=action, next_observation=following)
-
-    def _forward_value_estimator_keys(self, **kwargs: NestedKey) -> None:
-        pass
-
-    @property
-    def in_keys(self) -> list[NestedKey]:
-        """Keys of observation, action and next observation."""
-        keys = self.tensor_keys
-        return [keys.observation, keys.action, keys.next_observation]
 
     @property
     def out_keys(self) -> list[NestedKey]:
         """Names of the three terms."""
         return ["loss_reconstruction", "loss_kl", "loss_action"]
 
-    @dispatch
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """The three terms, reduced; with ``reduction="none"`` of the batch's shape."""
-        observation, action, following = (tensordict.get(key) for key in self.in_keys)
-        terms = self._terms(observation, action, following)
-        reduced = {
-            name: self._reduce_loss(term, tensordict=tensordict)
-            for name, term in zip(self.out_keys, terms, strict=True)
-        }
-        batch_size = tensordict.batch_size if self.reduction == "none" else []
-        return TensorDict._new_unsafe(reduced, torch.Size(batch_size))
-
-    def _terms(
+    def terms(
         self, observation: Tensor, action: Tensor, following: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
+        """The three terms, for one sample of z."""
         reward = self.reward
         observation, following = reward.scaler(observation), reward.scaler(following)
         mu, logvar = reward.encode(observation, following)
