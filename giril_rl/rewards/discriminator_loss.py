@@ -83,9 +83,6 @@ class DiscriminatorLoss(LossModule):
             policy_action=("policy", *action),
         )
 
-    def _forward_value_estimator_keys(self, **kwargs: NestedKey) -> None:
-        pass
-
     @property
     def in_keys(self) -> list[NestedKey]:
         """Keys of the expert's observation and action and of the policy's."""
