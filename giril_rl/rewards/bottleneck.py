@@ -14,12 +14,11 @@ from giril_rl.networks.vectors import mlp
 from giril_rl.rewards.actions import ActionEncoder
 from giril_rl.rewards.adversarial import RewardForm
 from giril_rl.rewards.discriminator import (
-    IN_KEYS,
-    OUT_KEYS,
     DiscriminatorReward,
     DiscriminatorScaling,
     discriminator_scaler,
 )
+from giril_rl.rewards.keys import PAIR_KEYS, REWARD_KEYS
 
 
 class BottleneckReward(DiscriminatorReward):
@@ -57,8 +56,8 @@ class BottleneckReward(DiscriminatorReward):
         normalise: DiscriminatorScaling = "standardise",
         clamp: float | None = 10.0,
         seed: int = 0,
-        in_keys: Sequence[NestedKey] = IN_KEYS,
-        out_keys: Sequence[NestedKey] = OUT_KEYS,
+        in_keys: Sequence[NestedKey] = PAIR_KEYS,
+        out_keys: Sequence[NestedKey] = REWARD_KEYS,
         latent: int = 8,
     ) -> BottleneckReward:
         """The paper's body for vector observations and a linear head on z.

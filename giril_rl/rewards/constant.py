@@ -7,6 +7,8 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 
+from giril_rl.rewards.keys import REWARD_KEYS
+
 
 class ConstantReward(TensorDictModuleBase):
     """Writes one constant as the reward of every transition, shape ``(*batch, 1)``.
@@ -29,7 +31,7 @@ class ConstantReward(TensorDictModuleBase):
         self,
         value: float = 1.0,
         *,
-        out_keys: tuple[NestedKey, ...] = (("next", "intrinsic_reward"),),
+        out_keys: tuple[NestedKey, ...] = REWARD_KEYS,
     ) -> None:
         super().__init__()
         self.value = value

@@ -8,8 +8,8 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, dispatch
 from tensordict.utils import NestedKey
 
-from giril_rl.errors import UserError
 from giril_rl.rewards.generative import reconstruction_error
+from giril_rl.rewards.keys import REWARD_KEYS, check_keys
 from giril_rl.rewards.scaler import ObservationScaler
 
 
@@ -47,14 +47,10 @@ class CopyReward(TensorDictModuleBase):
         *,
         scale: float = 1.0,
         in_keys: Sequence[NestedKey] = ("observation", ("next", "observation")),
-        out_keys: Sequence[NestedKey] = (("next", "intrinsic_reward"),),
+        out_keys: Sequence[NestedKey] = REWARD_KEYS,
     ) -> None:
         super().__init__()
-        if len(in_keys) != 2 or len(out_keys) != 1:
-            raise UserError(
-                "a copy reward has two in_keys (observation, next observation) and one out_key, "
-                f"not {list(in_keys)} and {list(out_keys)}."
-            )
+        check_keys("a copy reward", ("observation", "next observation"), in_keys, out_keys)
         self.in_keys: list[NestedKey] = list(in_keys)
         self.out_keys: list[NestedKey] = list(out_keys)
         self.scaler = scaler

@@ -11,13 +11,10 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.data import TensorSpec
 
-from giril_rl.errors import UserError
 from giril_rl.networks.vectors import mlp
 from giril_rl.rewards.actions import ActionEncoder
+from giril_rl.rewards.keys import REWARD_KEYS, TRANSITION_KEYS, check_keys
 from giril_rl.rewards.scaler import ObservationScaler, ScalingRule
-
-IN_KEYS: tuple[NestedKey, ...] = ("observation", "action", ("next", "observation"))
-OUT_KEYS: tuple[NestedKey, ...] = (("next", "intrinsic_reward"),)
 
 
 def feature_error(predicted: Tensor, features: Tensor) -> Tensor:
@@ -79,15 +76,13 @@ class CuriosityReward(TensorDictModuleBase):
         scaler: ObservationScaler,
         actions: ActionEncoder,
         scale: float = 1.0,
-        in_keys: Sequence[NestedKey] = IN_KEYS,
-        out_keys: Sequence[NestedKey] = OUT_KEYS,
+        in_keys: Sequence[NestedKey] = TRANSITION_KEYS,
+        out_keys: Sequence[NestedKey] = REWARD_KEYS,
     ) -> None:
         super().__init__()
-        if len(in_keys) != 3 or len(out_keys) != 1:
-            raise UserError(
-                "a curiosity reward has three in_keys (observation, action, next observation) "
-                f"and one out_key, not {list(in_keys)} and {list(out_keys)}."
-            )
+        check_keys(
+            "a curiosity reward", ("observation", "action", "next observation"), in_keys, out_keys
+        )
         self.in_keys: list[NestedKey] = list(in_keys)
         self.out_keys: list[NestedKey] = list(out_keys)
         self.features = features
@@ -109,8 +104,8 @@ class CuriosityReward(TensorDictModuleBase):
         normalise: ScalingRule = "standardise",
         clamp: bool = True,
         seed: int = 0,
-        in_keys: Sequence[NestedKey] = IN_KEYS,
-        out_keys: Sequence[NestedKey] = OUT_KEYS,
+        in_keys: Sequence[NestedKey] = TRANSITION_KEYS,
+        out_keys: Sequence[NestedKey] = REWARD_KEYS,
     ) -> CuriosityReward:
         """The paper's bodies for vector observations, initialised from ``seed`` alone.
 

@@ -17,12 +17,10 @@ from giril_rl.networks.normalise import RunningNormaliser
 from giril_rl.networks.vectors import mlp
 from giril_rl.rewards.actions import ActionEncoder
 from giril_rl.rewards.adversarial import RewardForm, adversarial_reward
+from giril_rl.rewards.keys import PAIR_KEYS, REWARD_KEYS, check_keys
 from giril_rl.rewards.scaler import ObservationScaler
 
 DiscriminatorScaling = Literal["running", "demo_range", "standardise", "raw"]
-
-IN_KEYS: tuple[NestedKey, ...] = ("observation", "action")
-OUT_KEYS: tuple[NestedKey, ...] = (("next", "intrinsic_reward"),)
 
 
 class DiscriminatorReward(TensorDictModuleBase):
@@ -59,16 +57,12 @@ class DiscriminatorReward(TensorDictModuleBase):
         scaler: nn.Module,
         actions: ActionEncoder,
         form: RewardForm = "positive",
-        in_keys: Sequence[NestedKey] = IN_KEYS,
-        out_keys: Sequence[NestedKey] = OUT_KEYS,
+        in_keys: Sequence[NestedKey] = PAIR_KEYS,
+        out_keys: Sequence[NestedKey] = REWARD_KEYS,
     ) -> None:
         super().__init__()
         adversarial_reward(torch.zeros(1), form)  # Refuses an unknown form before it is needed.
-        if len(in_keys) != 2 or len(out_keys) != 1:
-            raise UserError(
-                "a discriminator's reward has two in_keys (observation, action) and one out_key, "
-                f"not {list(in_keys)} and {list(out_keys)}."
-            )
+        check_keys("a discriminator's reward", ("observation", "action"), in_keys, out_keys)
         self.in_keys: list[NestedKey] = list(in_keys)
         self.out_keys: list[NestedKey] = list(out_keys)
         self.network = network
@@ -87,8 +81,8 @@ class DiscriminatorReward(TensorDictModuleBase):
         normalise: DiscriminatorScaling = "standardise",
         clamp: float | None = 10.0,
         seed: int = 0,
-        in_keys: Sequence[NestedKey] = IN_KEYS,
-        out_keys: Sequence[NestedKey] = OUT_KEYS,
+        in_keys: Sequence[NestedKey] = PAIR_KEYS,
+        out_keys: Sequence[NestedKey] = REWARD_KEYS,
     ) -> DiscriminatorReward:
         """The paper's body for vector observations, initialised from ``seed`` alone.
 

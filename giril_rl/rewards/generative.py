@@ -15,12 +15,10 @@ from torchrl.data import TensorSpec
 from giril_rl.errors import UserError
 from giril_rl.networks.vectors import mlp
 from giril_rl.rewards.actions import ActionEncoder
+from giril_rl.rewards.keys import REWARD_KEYS, TRANSITION_KEYS, check_keys
 from giril_rl.rewards.scaler import ObservationScaler, ScalingRule
 
 Prior = Literal["standard", "conditional"]
-
-IN_KEYS: tuple[NestedKey, ...] = ("observation", "action", ("next", "observation"))
-OUT_KEYS: tuple[NestedKey, ...] = (("next", "intrinsic_reward"),)
 
 
 def reconstruction_error(predicted: Tensor, target: Tensor) -> Tensor:
@@ -94,17 +92,15 @@ class GenerativeReward(TensorDictModuleBase):
         beta: float = 1.0,
         scale: float = 1.0,
         seed: int = 0,
-        in_keys: Sequence[NestedKey] = IN_KEYS,
-        out_keys: Sequence[NestedKey] = OUT_KEYS,
+        in_keys: Sequence[NestedKey] = TRANSITION_KEYS,
+        out_keys: Sequence[NestedKey] = REWARD_KEYS,
     ) -> None:
         super().__init__()
         if not 0 < beta <= 1:
             raise UserError(f"beta={beta} is outside (0, 1]: give a value such as 1.0.")
-        if len(in_keys) != 3 or len(out_keys) != 1:
-            raise UserError(
-                "a generative reward has three in_keys (observation, action, next observation) "
-                f"and one out_key, not {list(in_keys)} and {list(out_keys)}."
-            )
+        check_keys(
+            "a generative reward", ("observation", "action", "next observation"), in_keys, out_keys
+        )
         self.in_keys: list[NestedKey] = list(in_keys)
         self.out_keys: list[NestedKey] = list(out_keys)
         self.encoder = encoder
@@ -129,8 +125,8 @@ class GenerativeReward(TensorDictModuleBase):
         normalise: ScalingRule = "standardise",
         clamp: bool = True,
         seed: int = 0,
-        in_keys: Sequence[NestedKey] = IN_KEYS,
-        out_keys: Sequence[NestedKey] = OUT_KEYS,
+        in_keys: Sequence[NestedKey] = TRANSITION_KEYS,
+        out_keys: Sequence[NestedKey] = REWARD_KEYS,
     ) -> GenerativeReward:
         """The paper's bodies for vector observations, initialised from ``seed`` alone.
 

@@ -12,6 +12,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 
 from giril_rl.errors import UserError
+from giril_rl.rewards.keys import REWARD_KEYS
 
 
 class NoiseReward(TensorDictModuleBase):
@@ -48,7 +49,7 @@ class NoiseReward(TensorDictModuleBase):
         variance: float,
         *,
         seed: int = 0,
-        out_keys: Sequence[NestedKey] = (("next", "intrinsic_reward"),),
+        out_keys: Sequence[NestedKey] = REWARD_KEYS,
     ) -> None:
         super().__init__()
         for name, value in (("mean", mean), ("variance", variance)):
