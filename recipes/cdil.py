@@ -21,10 +21,11 @@ from giril_rl.configs import (
 )
 from giril_rl.demos import holdout, subsample
 from giril_rl.envs import make_env
-from giril_rl.rewards import CuriosityReward, CuriosityRewardLoss, FeatureTraining, ScalingRule
+from giril_rl.rewards import CuriosityRewardLoss, FeatureTraining
 from giril_rl.training import (
     Run,
     check_inputs,
+    curiosity_reward,
     finish_run,
     fit_reward,
     make_agent,
@@ -56,17 +57,7 @@ def main(cfg: Config, out: Path) -> None:
         env = make_env(cfg.task, cfg.ppo.num_envs, cfg.seed)
 
         reward_seed = cfg.seed if cfg.reward.seed is None else cfg.reward.seed
-        reward = CuriosityReward.for_vectors(
-            env.observation_spec["observation"].shape[-1],
-            env.action_spec,
-            hidden=cfg.reward.hidden,
-            model_hidden=cfg.reward.model_hidden,
-            scale=cfg.reward.scale,
-            normalise=cast(ScalingRule, cfg.reward.normalise),
-            clamp=cfg.reward.clamp,
-            seed=reward_seed,
-        )
-        reward.scaler.fit(demo.transitions["observation"])
+        reward = curiosity_reward(cfg.reward, env, demo, seed=reward_seed)
         fit_reward(
             CuriosityRewardLoss(reward, features=cast(FeatureTraining, cfg.reward.features)),
             subsample(demo, cfg.demo.subsample),

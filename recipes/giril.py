@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import cast
 
 from torchrl.envs import Compose
 
@@ -21,12 +20,13 @@ from giril_rl.configs import (
 )
 from giril_rl.demos import holdout, subsample
 from giril_rl.envs import make_env
-from giril_rl.rewards import GenerativeReward, GenerativeRewardLoss, Prior, ScalingRule
+from giril_rl.rewards import GenerativeRewardLoss
 from giril_rl.training import (
     Run,
     check_inputs,
     finish_run,
     fit_reward,
+    generative_reward,
     make_agent,
     obtain_demonstration,
     return_scaling,
@@ -56,18 +56,7 @@ def main(cfg: Config, out: Path) -> None:
         env = make_env(cfg.task, cfg.ppo.num_envs, cfg.seed)
 
         reward_seed = cfg.seed if cfg.reward.seed is None else cfg.reward.seed
-        reward = GenerativeReward.for_vectors(
-            env.observation_spec["observation"].shape[-1],
-            env.action_spec,
-            hidden=cfg.reward.hidden,
-            beta=cfg.reward.beta,
-            scale=cfg.reward.scale,
-            prior=cast(Prior, cfg.reward.prior),
-            normalise=cast(ScalingRule, cfg.reward.normalise),
-            clamp=cfg.reward.clamp,
-            seed=reward_seed,
-        )
-        reward.scaler.fit(demo.transitions["observation"])
+        reward = generative_reward(cfg.reward, env, demo, seed=reward_seed)
         fit_reward(
             GenerativeRewardLoss(reward, alpha=cfg.reward.alpha),
             subsample(demo, cfg.demo.subsample),

@@ -11,6 +11,7 @@ from giril_rl.training.ppo import PPOLearner, Trained, train_ppo
 from giril_rl.training.random_policy import RandomPolicy
 from giril_rl.training.result import finish_run
 from giril_rl.training.reward_learner import RewardLearner
+from giril_rl.training.reward_models import curiosity_reward, generative_reward
 from giril_rl.training.run import Run
 from giril_rl.training.scaling import return_scaling
 
@@ -25,10 +26,12 @@ __all__ = [
     "check_inputs",
     "clone_behaviour",
     "control_reward",
+    "curiosity_reward",
     "evaluate",
     "evaluate_both",
     "finish_run",
     "fit_reward",
+    "generative_reward",
     "load_agent",
     "make_agent",
     "obtain_demonstration",

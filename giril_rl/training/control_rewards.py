@@ -7,22 +7,20 @@ from typing import cast
 import torch
 from tensordict.nn import TensorDictModuleBase
 
-from giril_rl.configs import ControlRunConfig, CuriosityConfig, GenerativeConfig
+from giril_rl.configs import ControlRunConfig, GenerativeConfig
 from giril_rl.demos import Demonstration, holdout, subsample
 from giril_rl.envs import GymVectorEnv
 from giril_rl.rewards import (
     AffineReward,
     ConstantReward,
     CopyReward,
-    CuriosityReward,
-    GenerativeReward,
     GenerativeRewardLoss,
     NoiseReward,
     ObservationScaler,
-    Prior,
     ScalingRule,
 )
 from giril_rl.training.fit import fit_reward
+from giril_rl.training.reward_models import curiosity_reward, generative_reward
 from giril_rl.training.run import Run
 
 
@@ -49,8 +47,8 @@ def control_reward(
     seed = cfg.seed if part.seed is None else part.seed
     seeds = {"reward": seed, **seeds}
     if cfg.reward == "untrained_icm":
-        return _curiosity(cfg.icm, env, demo, seed), seeds
-    reward = _generative(cfg.giril, env, demo, seed)
+        return curiosity_reward(cfg.icm, env, demo, seed=seed), seeds
+    reward = generative_reward(cfg.giril, env, demo, seed=seed)
     if cfg.reward == "untrained_giril":
         return reward, seeds
     fit_reward(
@@ -90,45 +88,7 @@ def moments(reward: TensorDictModuleBase, demo: Demonstration) -> tuple[float, f
     return values.mean().item(), values.var(correction=0).item()
 
 
-def _size(env: GymVectorEnv) -> int:
-    return env.observation_spec["observation"].shape[-1]
-
-
 def _copy(cfg: GenerativeConfig, env: GymVectorEnv, demo: Demonstration) -> CopyReward:
-    scaler = ObservationScaler(_size(env), rule=cast(ScalingRule, cfg.normalise), clamp=cfg.clamp)
+    size = env.observation_spec["observation"].shape[-1]
+    scaler = ObservationScaler(size, rule=cast(ScalingRule, cfg.normalise), clamp=cfg.clamp)
     return CopyReward(scaler.fit(demo.transitions["observation"]), scale=cfg.scale)
-
-
-def _generative(
-    cfg: GenerativeConfig, env: GymVectorEnv, demo: Demonstration, seed: int
-) -> GenerativeReward:
-    reward = GenerativeReward.for_vectors(
-        _size(env),
-        env.action_spec,
-        hidden=cfg.hidden,
-        beta=cfg.beta,
-        scale=cfg.scale,
-        prior=cast(Prior, cfg.prior),
-        normalise=cast(ScalingRule, cfg.normalise),
-        clamp=cfg.clamp,
-        seed=seed,
-    )
-    reward.scaler.fit(demo.transitions["observation"])
-    return reward
-
-
-def _curiosity(
-    cfg: CuriosityConfig, env: GymVectorEnv, demo: Demonstration, seed: int
-) -> CuriosityReward:
-    reward = CuriosityReward.for_vectors(
-        _size(env),
-        env.action_spec,
-        hidden=cfg.hidden,
-        model_hidden=cfg.model_hidden,
-        scale=cfg.scale,
-        normalise=cast(ScalingRule, cfg.normalise),
-        clamp=cfg.clamp,
-        seed=seed,
-    )
-    reward.scaler.fit(demo.transitions["observation"])
-    return reward
