@@ -61,9 +61,9 @@ class TaskConfig:
     """The environment and what is known about it."""
 
     name: str = knob(MISSING, "name of the task, used for folders and tables")
-    env_id: str = knob(MISSING, "Gymnasium id; vector observation, Box or Discrete actions")
+    env_id: str = knob(MISSING, "Gymnasium id; vector observation or ALE/..., Box or Discrete")
     max_episode_steps: int | None = knob(
-        None, "time limit; null takes the one registered for the id", low=1
+        None, "time limit; null takes the one registered for the id (Atari: 27,000)", low=1
     )
     steps: int = knob(1_000_000, "default policy steps for this task", low=1)
     expert_score: float | None = knob(None, "mean training return at which the expert stops early")
@@ -80,6 +80,16 @@ class TaskConfig:
         "horizon=fixed: reset the simulator unnoticed, or continue from where it failed",
         choices=("reset", "continue"),
     )
+    episode: str = knob(
+        "life",
+        "Atari: a lost life ends an episode of training, or only the game's end does",
+        choices=("life", "game"),
+    )
+
+    @property
+    def is_atari(self) -> bool:
+        """Whether the environment is one of the Arcade Learning Environment."""
+        return self.env_id.startswith("ALE/")
 
 
 @dataclass
@@ -94,6 +104,7 @@ class PPOConfig:
     anneal_lr: bool = knob(False, "decrease the step size linearly to zero")
     clip: float = knob(0.1, "clipping range of the probability ratio", low=0, low_open=True)
     value_coef: float = knob(0.5, "weight of the squared value error", low=0)
+    clip_value: bool = knob(False, "clip the change of the value by the same range (Atari)")
     entropy_coef: float = knob(0.0, "weight of the entropy bonus", low=0)
     gamma: float = knob(0.99, "discount", low=0, high=1)
     lmbda: float = knob(0.95, "lambda of generalised advantage estimation", low=0, high=1)
@@ -130,6 +141,11 @@ class DemoConfig:
         1000, "transitions to record; null records `episodes` whole episodes", low=1
     )
     episodes: int | None = knob(None, "whole episodes to record (then length must be null)", low=1)
+    lives: str = knob(
+        "first",
+        "Atari: an episode goes up to the first lost life, or through all lives",
+        choices=("first", "all"),
+    )
     deterministic: bool = knob(True, "play the expert's mean action rather than a sampled one")
     seed: int = knob(0, "seed of the recorded episodes", low=0)
     subsample: int = knob(20, "keep 1 in k transitions, fixed once (paper: 20; 1 keeps all)", low=1)
@@ -329,6 +345,7 @@ class ExpertRunConfig(RunConfig):
 
     steps: int = knob(5_000_000, "most environment steps of expert training (paper: 5M)", low=1)
     stop_early: bool = knob(True, "stop once the mean return reaches task.expert_score")
+    clip_reward: bool = knob(False, "learn from the reward's sign (Atari); scores are unclipped")
     scaling: ScalingConfig = field(default_factory=lambda: ScalingConfig(reset="done"))
 
 

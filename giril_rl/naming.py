@@ -20,7 +20,11 @@ ADDED = {
     "task.expert_steps": 5_000_000,
     "task.horizon": "own",
     "task.after_failure": "reset",
+    "task.episode": "life",
     "termination": "ends",
+    "ppo.clip_value": False,
+    "demo.lives": "first",
+    "clip_reward": False,
 }
 """Keys that earlier runs did not have, with the value that they behaved by."""
 

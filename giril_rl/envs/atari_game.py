@@ -109,5 +109,5 @@ def _rom(game: str) -> tuple[type, str]:
     names = roms.get_all_rom_ids()
     if game not in names:
         hint = did_you_mean(game, names) or "; names are written as in space_invaders."
-        raise UserError(f"task.game={game} is not a game of ale-py{hint}")
+        raise UserError(f"{game} is not a game of ale-py{hint}")
     return ALEVectorInterface, str(roms.get_rom_path(game))

@@ -1,4 +1,4 @@
-"""A task's Gymnasium environments, registered by the packages that bring them."""
+"""A task's environments, registered by the packages that bring them."""
 
 from __future__ import annotations
 
@@ -11,6 +11,10 @@ from typing import cast
 import gymnasium
 
 from giril_rl.configs import TaskConfig
+from giril_rl.envs.atari import AtariEnv, Episode
+from giril_rl.envs.atari_game import FRAME_CAP
+from giril_rl.envs.atari_gym import AtariGymEnv
+from giril_rl.envs.batched import BatchedEnv
 from giril_rl.envs.fixed import AfterFailure, FixedHorizonEnv
 from giril_rl.envs.stdout import silent_stdout
 from giril_rl.envs.vector import GymVectorEnv
@@ -25,7 +29,8 @@ def gym_factory(task: TaskConfig) -> Callable[[], gymnasium.Env]:
     """A function that makes one Gymnasium environment of ``task``, time limit included.
 
     Args:
-        task: the task; ids ending in ``BulletEnv-v0`` come from ``pybullet_envs_gymnasium``.
+        task: the task; ids ending in ``BulletEnv-v0`` come from ``pybullet_envs_gymnasium``, those
+            that begin with ``ALE/`` are :class:`AtariGymEnv`, preprocessed.
 
     Raises:
         UserError: if the id is unknown, its package is missing, or it has no time limit.
@@ -34,13 +39,18 @@ def gym_factory(task: TaskConfig) -> Callable[[], gymnasium.Env]:
         >>> gym_factory(TaskConfig(name="cartpole", env_id="CartPole-v1"))().spec.id
         'CartPole-v1'
     """
+    if task.is_atari:
+        game = _game(task)
+
+        def make_game() -> gymnasium.Env:
+            env = AtariGymEnv(game, episode=cast(Episode, task.episode), frame_cap=_frames(task))
+            env.spec = _spec(task)
+            return env
+
+        return make_game
     if BULLET in task.env_id:
         _import(BULLET_PACKAGE)
-    try:
-        spec = gymnasium.spec(task.env_id)
-    except gymnasium.error.Error:
-        hint = did_you_mean(task.env_id, gymnasium.registry) or "; check its name and package."
-        raise UserError(f"task.env_id={task.env_id} is not a Gymnasium id{hint}") from None
+    spec = _spec(task)
     limit = task.max_episode_steps or spec.max_episode_steps
     if limit is None:
         raise UserError(
@@ -63,11 +73,30 @@ def gym_factory(task: TaskConfig) -> Callable[[], gymnasium.Env]:
     return make
 
 
-def make_env(task: TaskConfig, num_envs: int, seed: int) -> GymVectorEnv:
+def _spec(task: TaskConfig) -> gymnasium.envs.registration.EnvSpec:
+    try:
+        return gymnasium.spec(task.env_id)
+    except gymnasium.error.Error:
+        hint = did_you_mean(task.env_id, gymnasium.registry) or "; check its name and package."
+        raise UserError(f"task.env_id={task.env_id} is not a Gymnasium id{hint}") from None
+
+
+def _game(task: TaskConfig) -> str:
+    """The name of an Atari task's ROM."""
+    _import("ale_py", extra="atari")  # Registers the ids.
+    return str(_spec(task).kwargs["game"])
+
+
+def _frames(task: TaskConfig) -> int:
+    return FRAME_CAP if task.max_episode_steps is None else 4 * task.max_episode_steps
+
+
+def make_env(task: TaskConfig, num_envs: int, seed: int) -> BatchedEnv:
     """``num_envs`` environments of ``task`` as one TorchRL environment.
 
     Args:
-        task: the task; ``task.horizon="fixed"`` makes a :class:`FixedHorizonEnv`.
+        task: the task; ``task.horizon="fixed"`` makes a :class:`FixedHorizonEnv`, an id of the
+            Arcade Learning Environment an :class:`AtariEnv`.
         num_envs: batch size.
         seed: root of the episodes' seeds.
 
@@ -79,6 +108,14 @@ def make_env(task: TaskConfig, num_envs: int, seed: int) -> GymVectorEnv:
         >>> env.reset()["observation"].shape
         torch.Size([3, 4])
     """
+    if task.is_atari:
+        return AtariEnv(
+            _game(task),
+            num_envs,
+            episode=cast(Episode, task.episode),
+            seed=seed,
+            frame_cap=_frames(task),
+        )
     if task.horizon == "fixed":
         return FixedHorizonEnv(
             gym_factory(task),
@@ -89,8 +126,18 @@ def make_env(task: TaskConfig, num_envs: int, seed: int) -> GymVectorEnv:
     return GymVectorEnv(gym_factory(task), num_envs, seed=seed)
 
 
+def for_scores(task: TaskConfig) -> TaskConfig:
+    """The task as scores are counted: its own episodes, and whole games.
+
+    Examples:
+        >>> for_scores(TaskConfig(name="pong", env_id="ALE/Pong-v5", episode="life")).episode
+        'game'
+    """
+    return replace(with_own_episodes(task), episode="game")
+
+
 def with_own_episodes(task: TaskConfig) -> TaskConfig:
-    """The task with its own episodes, which end at a failure: what experts and scores play.
+    """The task with its own episodes, which end at a failure: what experts play.
 
     Examples:
         >>> fixed = TaskConfig(name="cartpole", env_id="CartPole-v1", horizon="fixed")
@@ -100,10 +147,9 @@ def with_own_episodes(task: TaskConfig) -> TaskConfig:
     return replace(task, horizon="own", after_failure="reset")
 
 
-def _import(package: str) -> None:
+def _import(package: str, extra: str | None = None) -> None:
     try:
         importlib.import_module(package)
     except ImportError:
-        raise UserError(
-            f"this task needs {package}, which is not installed: pip install {package}."
-        ) from None
+        command = f'pip install "giril-rl[{extra}]"' if extra else f"pip install {package}"
+        raise UserError(f"this task needs {package}, which is not installed: {command}.") from None

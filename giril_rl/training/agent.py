@@ -7,8 +7,7 @@ from pathlib import Path
 import torch
 
 from giril_rl.configs import PPOConfig, TaskConfig
-from giril_rl.envs import make_env
-from giril_rl.envs.vector import GymVectorEnv
+from giril_rl.envs import BatchedEnv, make_env
 from giril_rl.errors import UserError
 from giril_rl.networks.policy import ActorCritic
 from giril_rl.training.checkpoint import load_state, save_state
@@ -16,7 +15,7 @@ from giril_rl.training.checkpoint import load_state, save_state
 POLICY_FILE = "policy.safetensors"
 
 
-def make_agent(env: GymVectorEnv, cfg: PPOConfig, seed: int) -> ActorCritic:
+def make_agent(env: BatchedEnv, cfg: PPOConfig, seed: int) -> ActorCritic:
     """An untrained agent for ``env``, initialised from ``seed`` alone.
 
     Examples:

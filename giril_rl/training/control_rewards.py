@@ -9,7 +9,7 @@ from tensordict.nn import TensorDictModuleBase
 
 from giril_rl.configs import ControlRunConfig, GenerativeConfig
 from giril_rl.demos import Demonstration, holdout, subsample
-from giril_rl.envs import GymVectorEnv
+from giril_rl.envs import BatchedEnv
 from giril_rl.rewards import (
     AffineReward,
     ConstantReward,
@@ -25,7 +25,7 @@ from giril_rl.training.run import Run
 
 
 def control_reward(
-    cfg: ControlRunConfig, env: GymVectorEnv, demo: Demonstration | None, run: Run
+    cfg: ControlRunConfig, env: BatchedEnv, demo: Demonstration | None, run: Run
 ) -> tuple[TensorDictModuleBase, dict[str, int]]:
     """The reward module that ``cfg.reward`` names, and the seeds that it depends on.
 
@@ -88,7 +88,7 @@ def moments(reward: TensorDictModuleBase, demo: Demonstration) -> tuple[float, f
     return values.mean().item(), values.var(correction=0).item()
 
 
-def _copy(cfg: GenerativeConfig, env: GymVectorEnv, demo: Demonstration) -> CopyReward:
+def _copy(cfg: GenerativeConfig, env: BatchedEnv, demo: Demonstration) -> CopyReward:
     size = env.observation_spec["observation"].shape[-1]
     scaler = ObservationScaler(size, rule=cast(ScalingRule, cfg.normalise), clamp=cfg.clamp)
     return CopyReward(scaler.fit(demo.transitions["observation"]), scale=cfg.scale)

@@ -12,7 +12,7 @@ from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from giril_rl.configs import TaskConfig
-from giril_rl.envs import make_env, with_own_episodes
+from giril_rl.envs import for_scores, make_env
 
 
 class Player(Protocol):
@@ -54,7 +54,8 @@ def evaluate(
 
     Args:
         agent: the policy; its running normalisation is used as it is and not updated.
-        task: the task to play; always its own episodes, whatever ``task.horizon`` says.
+        task: the task to play; always its own episodes and whole games, whatever
+            ``task.horizon`` and ``task.episode`` say.
         episodes: number of episodes.
         seed: root of the episodes' seeds and seed of the sampled actions.
         deterministic: play the distribution's mode rather than samples.
@@ -72,7 +73,7 @@ def evaluate(
         >>> scores.episodes, scores.return_mean == scores.episode_length_mean
         (5, True)
     """
-    env = make_env(with_own_episodes(task), episodes, seed)
+    env = make_env(for_scores(task), episodes, seed)
     policy = agent.acting()
     mode = ExplorationType.DETERMINISTIC if deterministic else ExplorationType.RANDOM
     returns = torch.zeros(episodes, dtype=torch.float64)

@@ -15,7 +15,7 @@ from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
 from giril_rl.configs import PPOConfig
-from giril_rl.envs.vector import GymVectorEnv
+from giril_rl.envs import BatchedEnv
 from giril_rl.errors import UserError
 from giril_rl.networks.policy import NORMALISED, ActorCritic
 from giril_rl.progress import progress
@@ -46,7 +46,7 @@ class Trained(NamedTuple):
 
 
 def train_ppo(
-    env: GymVectorEnv,
+    env: BatchedEnv,
     agent: ActorCritic,
     relabel: nn.Module,
     cfg: PPOConfig,

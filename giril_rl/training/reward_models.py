@@ -6,12 +6,12 @@ from typing import cast
 
 from giril_rl.configs import CuriosityConfig, GenerativeConfig
 from giril_rl.demos import Demonstration
-from giril_rl.envs import GymVectorEnv
+from giril_rl.envs import BatchedEnv
 from giril_rl.rewards import CuriosityReward, GenerativeReward, Prior, ScalingRule
 
 
 def generative_reward(
-    cfg: GenerativeConfig, env: GymVectorEnv, demo: Demonstration, *, seed: int
+    cfg: GenerativeConfig, env: BatchedEnv, demo: Demonstration, *, seed: int
 ) -> GenerativeReward:
     """GIRIL's reward module, to be fitted.
 
@@ -47,7 +47,7 @@ def generative_reward(
 
 
 def curiosity_reward(
-    cfg: CuriosityConfig, env: GymVectorEnv, demo: Demonstration, *, seed: int
+    cfg: CuriosityConfig, env: BatchedEnv, demo: Demonstration, *, seed: int
 ) -> CuriosityReward:
     """CDIL's reward module, to be fitted.
 

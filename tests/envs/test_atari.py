@@ -1,0 +1,251 @@
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium.wrappers import AtariPreprocessing
+from tensordict import TensorDict
+from torchrl.envs.utils import check_env_specs
+
+from giril_rl.configs import TaskConfig
+from giril_rl.envs import AtariEnv, AtariGymEnv, for_scores, gym_factory, make_env
+from giril_rl.envs.atari_game import AtariGame
+from giril_rl.errors import UserError
+
+ale_py = pytest.importorskip("ale_py")
+gymnasium.register_envs(ale_py)
+
+BREAKOUT = TaskConfig(name="breakout", env_id="ALE/Breakout-v5")
+IDS = {
+    "space_invaders": "SpaceInvaders",
+    "beam_rider": "BeamRider",
+    "breakout": "Breakout",
+    "qbert": "Qbert",
+    "seaquest": "Seaquest",
+    "kung_fu_master": "KungFuMaster",
+}
+ACTIONS = {
+    "space_invaders": 6,
+    "beam_rider": 9,
+    "breakout": 4,
+    "qbert": 6,
+    "seaquest": 18,
+    "kung_fu_master": 14,
+}
+
+
+def raw_env(game):
+    return gymnasium.make(
+        f"ALE/{IDS[game]}-v5", frameskip=1, repeat_action_probability=0.0, full_action_space=False
+    )
+
+
+def in_step_with(game, env):
+    """Gymnasium's own preprocessing, after as many frames without action as ``game`` began with."""
+    gym_env = AtariPreprocessing(env, noop_max=0, frame_skip=4)
+    gym_env.reset(seed=0)
+    info = game._ale.reset([0], [3])[1]
+    for _ in range(int(info["episode_frame_number"][0])):
+        env.unwrapped.step(0)
+    return gym_env
+
+
+@pytest.mark.parametrize("name", IDS)
+def test_frames_rewards_and_ends_are_those_of_gymnasiums_preprocessing(name):
+    game = AtariGame(name)
+    gym_env = in_step_with(game, raw_env(name))
+    rng = np.random.default_rng(0)
+    total, steps = 0.0, 0
+    for _ in range(250):
+        action = int(rng.integers(len(game.meanings)))
+        shown = game.play(action)
+        frame, reward, over, _, info = gym_env.step(action)
+        assert np.array_equal(shown.frame, frame)
+        assert (shown.reward, shown.over, shown.lives) == (reward, over, info["lives"])
+        total, steps = total + reward, steps + 1
+        if over:
+            break
+    assert steps > 100
+    assert len(game.meanings) == ACTIONS[name]
+    assert game.fires == (name != "kung_fu_master")
+
+
+def play(env, steps, seed=0):
+    """A rollout of random actions, as a collector steps: batch ``(num_envs, steps)``."""
+    generator = torch.Generator().manual_seed(seed)
+    count, root, batch = env.action_spec.space.n, env.reset(), []
+    for _ in range(steps):
+        root.set("action", torch.randint(count, env.batch_size, generator=generator))
+        after, root = env.step_and_maybe_reset(root)
+        batch.append(after.clone())
+    return torch.stack(batch, 1)
+
+
+@pytest.mark.parametrize("episode", ["life", "game"])
+def test_specs(episode):
+    for stop in (True, False):
+        check_env_specs(AtariEnv("breakout", 2, episode=episode), break_when_any_done=stop)
+
+
+def test_a_lost_life_ends_an_episode_with_its_own_last_stack_and_not_the_game():
+    batch = play(AtariEnv("breakout", 3, seed=1), 250)
+    following = batch["next", "observation"]
+    done = batch["next", "done"].squeeze(-1)
+    over = batch["next", "game_over"].squeeze(-1)
+    assert done.sum() > over.sum() > 0 and not (over & ~done).any()
+    assert torch.equal(done, batch["next", "terminated"].squeeze(-1))
+    # The end's stack continues that life's: no jump to what comes after.
+    assert torch.equal(following[..., :3, :, :], batch["observation"][..., 1:, :, :])
+    assert (following[done][:, 2:].flatten(1).float().mean(1) > 0).all()
+    # Within an episode the next observation is the next step's; after its end it is not.
+    same = (following[:, :-1] == batch["observation"][:, 1:]).flatten(2).all(-1)
+    assert torch.equal(same, ~done[:, :-1])
+    # A new life begins with one frame and black.
+    first = batch["observation"][:, 1:][done[:, :-1]]
+    assert (first[:, :3] == 0).all() and (first[:, 3] > 0).flatten(1).any(1).all()
+
+
+def test_after_a_lost_life_the_game_goes_on_and_after_a_game_another_begins():
+    """Breakout's bricks, rows 24 to 37, stay broken over lives and are whole in a new game."""
+    env = AtariEnv("breakout", 1, seed=0)
+
+    def bricks(frame):
+        return int((frame[24:38] > 0).sum())
+
+    root, generator = env.reset(), torch.Generator().manual_seed(0)
+    whole, lives, seen = bricks(root["observation"][0, -1]), [], {"life": 0, "game": 0}
+    while seen["game"] < 2:
+        root.set("action", torch.randint(4, (1,), generator=generator))
+        after, root = env.step_and_maybe_reset(root)
+        if after["next", "done"].item():
+            before = bricks(after["next", "observation"][0, -1])
+            now = bricks(root["observation"][0, -1])
+            over = after["next", "game_over"].item()
+            seen["game" if over else "life"] += 1
+            lives.append(int(env.lives[0]))
+            assert now == (whole if over else before)
+    assert seen["life"] == 8 and lives == [4, 3, 2, 1, 5, 4, 3, 2, 1, 5]
+
+
+@pytest.mark.parametrize("name", ["breakout", "space_invaders", "kung_fu_master"])
+def test_whole_game_scores_are_those_of_a_plain_loop(name):
+    """The same game step by step by hand: all lives, unclipped."""
+    task = TaskConfig(name=name, env_id=f"ALE/{IDS[name]}-v5")
+    env = make_env(for_scores(task), 1, seed=4)
+    generator = torch.Generator().manual_seed(0)
+    actions, score, root = [], 0.0, env.reset()
+    while True:
+        action = torch.randint(ACTIONS[name], (1,), generator=generator)
+        actions.append(int(action))
+        root.set("action", action)
+        after, root = env.step_and_maybe_reset(root)
+        score += after["next", "reward"].item()
+        if after["next", "done"].item():
+            break
+    assert after["next", "game_over"].item()
+
+    game = AtariGame(name)
+    _, lives = game.reset(int(np.random.SeedSequence([4, 0, 0]).generate_state(1)[0]))
+    plain = 0.0
+    opening = [1, 2] if game.fires else []
+    for action in opening:
+        plain += game.play(action).reward
+    for action in actions:
+        shown = game.play(action)
+        plain += shown.reward
+        if 0 < shown.lives < lives and not shown.over:
+            for extra in (0, *opening):
+                shown = game.play(extra)
+                plain += shown.reward
+        lives = shown.lives
+    assert shown.over and plain == score and score > 0
+
+
+def test_a_game_is_cut_at_the_frame_cap():
+    env = AtariEnv("breakout", 1, episode="game", frame_cap=60)
+    batch = play(env, 15)
+    ends = batch["next", "truncated"].squeeze(-1)[0]
+    assert ends.any() and not batch["next", "terminated"].any()
+    assert torch.equal(ends, batch["next", "done"].squeeze(-1)[0])
+    assert torch.equal(ends, batch["next", "game_over"].squeeze(-1)[0])
+
+
+@pytest.mark.parametrize("episode", ["life", "game"])
+def test_a_restored_env_goes_on_as_the_first_would_have(episode):
+    first = AtariEnv("breakout", 3, episode=episode, seed=2)
+    play(first, 130)
+    state = first.simulator_state()
+    assert all(isinstance(value, (int, torch.Tensor)) for value in state.values())
+    second = AtariEnv("breakout", 3, episode=episode, seed=99)
+    second.restore_simulator(state)
+    roots = [first._root(torch.from_numpy(first._last_observation.copy())), second.reset()]
+    generator = torch.Generator().manual_seed(7)
+    ended = 0
+    for _ in range(150):
+        action = torch.randint(4, (3,), generator=generator)
+        afters = []
+        for i, env in enumerate((first, second)):
+            roots[i].set("action", action)
+            after, roots[i] = env.step_and_maybe_reset(roots[i])
+            afters.append(after)
+        assert (afters[0] == afters[1]).all()
+        ended += int(afters[0]["next", "done"].sum())
+    assert ended > 3
+
+
+def test_a_replay_that_ends_elsewhere_is_refused():
+    env = AtariEnv("breakout", 1)
+    play(env, 20)
+    state = env.simulator_state()
+    state["actions"] = state["actions"].clone().fill_(3)
+    with pytest.raises(UserError, match="does not repeat itself"):
+        AtariEnv("breakout", 1).restore_simulator(state)
+
+
+def test_games_of_one_batch_differ_and_a_seed_repeats_them():
+    one, again, other = (play(AtariEnv("seaquest", 2, seed=s), 60) for s in (0, 0, 1))
+    assert (one == again).all()
+    assert not torch.equal(one["observation"], other["observation"])
+    assert not torch.equal(one["observation"][0], one["observation"][1])
+
+
+def test_a_batch_keeps_what_it_was_given():
+    """Openings rewrite stacks: those that were handed out before stay as they were."""
+    env = AtariEnv("breakout", 2, seed=1)
+    generator, root, kept = torch.Generator().manual_seed(0), env.reset(), []
+    for _ in range(120):
+        root.set("action", torch.randint(4, (2,), generator=generator))
+        after, root = env.step_and_maybe_reset(root)
+        kept.append((after["next", "observation"], after["next", "observation"].clone()))
+    assert all(torch.equal(now, then) for now, then in kept)
+
+
+def test_the_gymnasium_form_shows_the_same():
+    make = gym_factory(BREAKOUT)
+    env, batched = make(), AtariEnv("breakout", 1, seed=11)
+    root = batched.reset()
+    observation, info = env.reset(seed=11)
+    assert np.array_equal(observation, root["observation"][0]) and info["lives"] == 5
+    assert env.spec.id == "ALE/Breakout-v5" and env.observation_space.contains(observation)
+    rng = np.random.default_rng(0)
+    for _ in range(60):
+        action = int(rng.integers(4))
+        observation, reward, terminated, truncated, info = env.step(action)
+        after = batched._step(TensorDict({"action": torch.tensor([action])}, [1]))
+        assert np.array_equal(observation, after["observation"][0])
+        assert (reward, terminated, truncated) == (
+            after["reward"].item(),
+            after["terminated"].item(),
+            after["truncated"].item(),
+        )
+        if terminated:
+            break
+    assert terminated and info["lives"] == 4
+
+
+def test_refusals():
+    with pytest.raises(UserError, match="is not a Gymnasium id; did you mean 'ALE/Breakout-v5'"):
+        make_env(TaskConfig(name="x", env_id="ALE/Brekout-v5"), 1, seed=0)
+    with pytest.raises(UserError, match="brekout is not a game of ale-py; did you mean 'breakout'"):
+        AtariGame("brekout")
+    with pytest.raises(UserError, match="choose one of life, game"):
+        AtariGymEnv("breakout", episode="lives")
