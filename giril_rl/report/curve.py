@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from giril_rl.files import write_atomically
+from giril_rl.report.drawing import new_figure, save, thousands
 
 _RETURN, _EPISODES = "train/return_mean", "train/episodes"
 
@@ -82,13 +83,7 @@ def write_curve(
     writer.writerows((step, mean, "" if count is None else count) for step, mean, count in points)
     write_atomically(folder / "curve.csv", text.getvalue())
 
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-    from matplotlib.ticker import FuncFormatter
-
-    # A Figure of its own rather than pyplot: no window, no global state of the caller's touched.
-    figure = Figure(figsize=(8, 5), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(8, 5)
     axes = figure.add_subplot()
     if points:
         steps, means, _ = zip(*points, strict=True)
@@ -127,12 +122,10 @@ def write_curve(
     axes.set_title(f"{recipe} on {task}, seed {seed}")
     axes.set_xlabel("environment steps")
     axes.set_ylabel("return of an episode (the task's own score)")
-    for axis in (axes.xaxis, axes.yaxis):
-        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.10g}"))
+    thousands(axes.xaxis)
+    thousands(axes.yaxis)
     axes.grid(alpha=0.3)
     if axes.get_legend_handles_labels()[0]:
         axes.legend()
-    picture = io.BytesIO()
-    figure.savefig(picture, format="png", dpi=120)
-    write_atomically(folder / "curve.png", picture.getvalue())
+    save(figure, folder / "curve.png")
     return folder / "curve.csv", folder / "curve.png"

@@ -10,7 +10,7 @@ from giril_rl.files import write_atomically
 
 
 def new_figure(width: float, height: float) -> Any:
-    """A matplotlib figure of its own: no window, no global state of the caller's touched."""
+    """A matplotlib figure of its own, not pyplot's: no window, no global state is touched."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from giril_rl.files import write_atomically
+from giril_rl.report.drawing import new_figure, save
 
 SETS = ("fitted", "held_out")
 
@@ -76,11 +77,7 @@ def write_losses(
     writer.writerows(points)
     write_atomically(folder / "curve.csv", text.getvalue())
 
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(8, 5), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(8, 5)
     axes = figure.add_subplot()
     for column, name in enumerate(SETS, 1):
         pairs = [(point[0], point[column]) for point in points if point[column] is not None]
@@ -94,7 +91,5 @@ def write_losses(
     axes.grid(alpha=0.3)
     if points:
         axes.legend()
-    picture = io.BytesIO()
-    figure.savefig(picture, format="png", dpi=120)
-    write_atomically(folder / "curve.png", picture.getvalue())
+    save(figure, folder / "curve.png")
     return folder / "curve.csv", folder / "curve.png"
