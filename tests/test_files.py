@@ -3,7 +3,7 @@ import os
 import pytest
 
 from giril_rl.errors import UserError
-from giril_rl.files import read_json, write_atomically, write_json
+from giril_rl.files import csv_text, read_json, write_atomically, write_json
 
 
 def test_failed_write_keeps_the_old_file_and_leaves_nothing_else(tmp_path, monkeypatch):
@@ -30,3 +30,8 @@ def test_json_round_trip_and_refusals(tmp_path):
     path.write_text('{"x": ')
     with pytest.raises(UserError, match="cannot be read as JSON"):
         read_json(path)
+
+
+def test_csv_has_empty_cells_for_none_and_quotes_what_needs_it():
+    text = csv_text(("a", "b"), [(None, 0.1 + 0.2), ('x "y", z', 1)])
+    assert text == 'a,b\n,0.30000000000000004\n"x ""y"", z",1\n'

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from giril_rl.files import write_atomically
+from giril_rl.files import csv_text, write_atomically
 from giril_rl.report.drawing import new_figure, save, thousands
 
 _RETURN, _EPISODES = "train/return_mean", "train/episodes"
@@ -77,11 +75,8 @@ def write_curve(
     """
     folder = Path(folder)
     points = curve_points(rows)
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["step", "return_mean", "episodes"])
-    writer.writerows((step, mean, "" if count is None else count) for step, mean, count in points)
-    write_atomically(folder / "curve.csv", text.getvalue())
+    text = csv_text(["step", "return_mean", "episodes"], points)
+    write_atomically(folder / "curve.csv", text)
 
     figure = new_figure(8, 5)
     axes = figure.add_subplot()

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Iterable, Sequence
 from typing import Any
 
+from giril_rl.files import csv_text
 from giril_rl.report.rows import Row
 from giril_rl.report.statistics import Estimate
 from giril_rl.report.tables import Line, Table
@@ -127,18 +126,14 @@ def markdown(table: Table) -> str:
 
 def to_csv(tables: Sequence[Table]) -> str:
     """All lines of all tables as CSV with the columns :data:`COLUMNS`, numbers unrounded."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(COLUMNS)
-    writer.writerows(_cells(table, line) for table in tables for line in table.lines)
-    return text.getvalue()
+    return csv_text(COLUMNS, (_cells(table, line) for table in tables for line in table.lines))
 
 
 def _cells(table: Table, line: Line) -> list[Any]:
     row, panel = line.row, line.panel
     mean, middle = row.estimates
     better = line.improvement
-    values = [
+    return [
         table.name,
         panel.task,
         " ".join(f"{key}={value}" for key, value in panel.changes),
@@ -158,4 +153,3 @@ def _cells(table: Table, line: Line) -> list[Any]:
         panel.reference("demo"),
         panel.reference("expert"),
     ]
-    return ["" if value is None else value for value in values]

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from giril_rl.files import write_atomically
+from giril_rl.files import csv_text, write_atomically
 from giril_rl.report.drawing import new_figure, save
 
 SETS = ("fitted", "held_out")
@@ -71,11 +69,7 @@ def write_losses(
     """
     folder = Path(folder)
     points = loss_points(rows)
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["step", *SETS])
-    writer.writerows(points)
-    write_atomically(folder / "curve.csv", text.getvalue())
+    write_atomically(folder / "curve.csv", csv_text(["step", *SETS], points))
 
     figure = new_figure(8, 5)
     axes = figure.add_subplot()

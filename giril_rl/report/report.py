@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Sequence
 from pathlib import Path
 
-from giril_rl.files import write_atomically
+from giril_rl.files import csv_text, write_atomically
 from giril_rl.naming import safe
 from giril_rl.report.bars import draw_bars
 from giril_rl.report.curves import draw_results, draw_varied
@@ -155,16 +153,14 @@ def _without_result(unfinished: Sequence[Unfinished]) -> str:
 
 
 def _runs_csv(runs: Sequence[RunRecord], unfinished: Sequence[Unfinished]) -> str:
-    text = io.StringIO()
-    writer = csv.DictWriter(text, _RUN_COLUMNS, lineterminator="\n", restval="")
-    writer.writeheader()
+    rows = []
     for run in runs:
         result = run.result or {}
         row = {key: result.get(key) for key in _RUN_COLUMNS}
         row["folder"], row["state"] = run.name, "finished"
         row["reward_seed"] = result.get("seeds", {}).get("reward")
         row["mode_return_mean"] = (result.get("deterministic") or {}).get("return_mean")
-        writer.writerow({key: value for key, value in row.items() if value is not None})
+        rows.append(row)
     for other in unfinished:
-        writer.writerow({"folder": other.name, "state": other.state, "last_line": other.reason})
-    return text.getvalue()
+        rows.append({"folder": other.name, "state": other.state, "last_line": other.reason})
+    return csv_text(_RUN_COLUMNS, ([row.get(key) for key in _RUN_COLUMNS] for row in rows))

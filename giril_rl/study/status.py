@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 from collections import Counter
 from collections.abc import Sequence
@@ -13,7 +11,7 @@ from typing import Literal
 
 import yaml
 
-from giril_rl.files import write_atomically, write_json
+from giril_rl.files import csv_text, write_atomically, write_json
 from giril_rl.naming import config_hash, safe
 from giril_rl.study.plan import StudyRun
 from giril_rl.study.spec import Spec
@@ -135,11 +133,9 @@ class StudyFolder:
         states = Counter(row["state"] for row in rows)
         content = {"study": self.spec.name, "states": dict(sorted(states.items())), "runs": rows}
         write_json(self.path / "status.json", content)
-        text = io.StringIO()
-        writer = csv.DictWriter(text, [f.name for f in fields(Standing)], lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
-        write_atomically(self.path / "status.csv", text.getvalue())
+        columns = [field.name for field in fields(Standing)]
+        text = csv_text(columns, (row.values() for row in rows))
+        write_atomically(self.path / "status.csv", text)
 
 
 class _Plain(yaml.SafeDumper):
