@@ -1,4 +1,4 @@
-"""The leaves of a config dataclass: every dotted key with its type, help and limits."""
+"""Dotted keys: of a config dataclass, with their type, help and limits, and of plain settings."""
 
 from __future__ import annotations
 
@@ -75,3 +75,28 @@ def leaves(config: type[Any], prefix: str = "") -> Iterator[Leaf]:
             yield from leaves(kind, f"{prefix}{part.name}.")  # type: ignore[arg-type]
         else:
             yield Leaf(f"{prefix}{part.name}", kind, part.metadata)
+
+
+def flat(
+    values: Mapping[Any, Any], prefix: str = "", *, keep_empty: bool = False
+) -> dict[str, Any]:
+    """Nested settings as ``{dotted key: value}``.
+
+    Args:
+        values: nested settings.
+        prefix: dotted key of ``values`` itself, with the dot.
+        keep_empty: whether a mapping with nothing in it is a value; else it is left out.
+
+    Examples:
+        >>> flat({"seed": 1, "ppo": {"lr": 0.1}, "task": {}})
+        {'seed': 1, 'ppo.lr': 0.1}
+        >>> flat({"ppo": {"lr": 0.1}, "task": {}}, keep_empty=True)
+        {'ppo.lr': 0.1, 'task': {}}
+    """
+    found: dict[str, Any] = {}
+    for key, value in values.items():
+        if isinstance(value, Mapping) and (value or not keep_empty):
+            found.update(flat(value, f"{prefix}{key}.", keep_empty=keep_empty))
+        else:
+            found[f"{prefix}{key}"] = value
+    return found

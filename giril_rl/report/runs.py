@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,6 +11,7 @@ import yaml
 
 from giril_rl.errors import UserError
 from giril_rl.files import read_json
+from giril_rl.schema import flat
 from giril_rl.training.metrics import read_metrics
 
 
@@ -66,22 +66,6 @@ class Unfinished:
     state: str
     steps: str
     reason: str
-
-
-def flat(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested settings with dotted keys.
-
-    Examples:
-        >>> flat({"seed": 1, "ppo": {"lr": 0.1}})
-        {'seed': 1, 'ppo.lr': 0.1}
-    """
-    found: dict[str, Any] = {}
-    for key, value in config.items():
-        if isinstance(value, Mapping):
-            found.update(flat(value, f"{prefix}{key}."))
-        else:
-            found[f"{prefix}{key}"] = value
-    return found
 
 
 def read_runs(folder: Path) -> tuple[list[RunRecord], list[Unfinished]]:

@@ -11,7 +11,8 @@ from typing import Any
 
 from giril_rl.errors import UserError
 from giril_rl.naming import NO_EFFECT
-from giril_rl.report.runs import RunRecord, flat
+from giril_rl.report.runs import RunRecord
+from giril_rl.schema import flat
 
 WITHOUT_PROFILE = frozenset({"expert", "gail", "vail", "bc", "control:random"})
 """Methods that never average rewards over environments, so that both profiles are one run."""

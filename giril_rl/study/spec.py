@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,6 +10,7 @@ from typing import Any
 from giril_rl.errors import UserError
 from giril_rl.nearest import did_you_mean
 from giril_rl.recipes import shipped_conf
+from giril_rl.schema import flat
 
 _KEYS = ("title", "all", "groups")
 
@@ -131,16 +132,7 @@ def _group(path: Path, number: int, entry: Any, shared: Mapping[str, Any]) -> Gr
     recipes = recipes if isinstance(recipes, list) else [recipes]
     if not recipes or not all(isinstance(name, str) for name in recipes):
         raise UserError(f"{path}: group {label!r} has no recipe: give one, or a list of them.")
-    knobs = {**dict(_flat(shared)), **dict(_flat(own))}
-    return Group(label, tuple(recipes), knobs)
-
-
-def _flat(values: Mapping[Any, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    for key, value in values.items():
-        if isinstance(value, dict):
-            yield from _flat(value, f"{prefix}{key}.")
-        else:
-            yield f"{prefix}{key}", value
+    return Group(label, tuple(recipes), {**flat(shared), **flat(own)})
 
 
 def override_text(key: str, value: Any, *, is_list: bool = False) -> str:

@@ -15,6 +15,7 @@ from filelock import FileLock, Timeout
 from giril_rl.errors import UserError
 from giril_rl.files import installed_versions, read_json, write_atomically, write_json
 from giril_rl.naming import NO_EFFECT, without_added
+from giril_rl.schema import flat
 from giril_rl.training.checkpoint import load_state, save_state
 from giril_rl.training.metrics import MetricsFile, check_logger, make_logger
 
@@ -223,22 +224,11 @@ class Run:
         write_json(path, self.versions)
 
 
-def _flatten(config: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for key, value in config.items():
-        name = f"{prefix}{key}"
-        if isinstance(value, Mapping) and value:
-            flat.update(_flatten(value, f"{name}."))
-        else:
-            flat[name] = value
-    return flat
-
-
 def _differences(
     before: Mapping[str, Any], now: Mapping[str, Any], ignore: Collection[str]
 ) -> list[str]:
     """``"ppo.lr: 0.1 there, 0.2 now"`` for each dotted key whose values differ."""
-    old, new = _flatten(without_added(before)), _flatten(without_added(now))
+    old, new = (flat(without_added(config), keep_empty=True) for config in (before, now))
     return [
         f"{key}: {old.get(key, 'nothing')!s} there, {new.get(key, 'nothing')!s} now"
         for key in [*new, *(key for key in old if key not in new)]
