@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import NoReturn
 
 from giril_rl import recipes
-from giril_rl.errors import UserError
+from giril_rl.errors import INTERRUPTED, UserError
 from giril_rl.nearest import did_you_mean
 
 
@@ -229,7 +229,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _COMMANDS[words[0]][0](words[1:])
     except KeyboardInterrupt as interrupt:
         print(f"giril: {str(interrupt) or 'interrupted'}.", file=sys.stderr)
-        return 130
+        return INTERRUPTED
     except BrokenPipeError:
         # The reader, such as `head`, has seen enough; nothing may be flushed into its pipe again.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -1,4 +1,7 @@
-"""The one exception that a user is meant to read."""
+"""The one exception that a user is meant to read, and how a command ends that was interrupted."""
+
+INTERRUPTED = 130
+"""The exit code after Ctrl-C."""
 
 
 class UserError(Exception):

@@ -14,12 +14,12 @@ from typing import Protocol
 
 from filelock import FileLock, Timeout
 
+from giril_rl.errors import INTERRUPTED
 from giril_rl.progress import progress
 from giril_rl.study.config import StudyConfig
 from giril_rl.study.plan import StudyRun
 from giril_rl.study.status import StudyFolder, last_line
 
-INTERRUPTED = 130
 PAUSE = 0.1  # seconds between looks at the runs
 
 

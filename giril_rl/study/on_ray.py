@@ -10,12 +10,11 @@ import signal
 from pathlib import Path
 from typing import Any
 
-from giril_rl.errors import UserError
+from giril_rl.errors import INTERRUPTED, UserError
 from giril_rl.study.plan import StudyRun
 
 KILLED = -int(signal.SIGKILL)
 """The code of a run whose worker is gone."""
-INTERRUPTED = 130
 
 
 class RayLauncher:
