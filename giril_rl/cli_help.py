@@ -11,22 +11,7 @@ from omegaconf import OmegaConf
 
 from giril_rl.compose import compose, groups
 from giril_rl.recipes import Recipe
-from giril_rl.schema import Leaf, leaves
-
-
-def _default(value: Any) -> str:
-    if value == "???":
-        return "(needed)"
-    if isinstance(value, bool):
-        return str(value).lower()
-    return "null" if value is None else str(value).replace(" ", "")
-
-
-def _line(leaf: Leaf) -> str:
-    words = leaf.help
-    if leaf.choices:
-        words += f" {{{', '.join(leaf.choices)}}}"
-    return words
+from giril_rl.schema import default_text, leaves
 
 
 def _row(columns: Sequence[str], widths: Sequence[int], text: str, width: int) -> list[str]:
@@ -63,7 +48,7 @@ def recipe_help(recipe: Recipe, config: type[Any], texts: Sequence[str] = ()) ->
         parent = OmegaConf.select(node, leaf.key.rpartition(".")[0]) if "." in leaf.key else node
         name = leaf.key.rpartition(".")[2]
         missing = OmegaConf.is_missing(parent, name)
-        rows.append((leaf, "(needed)" if missing else _default(_value(parent, name))))
+        rows.append((leaf, "(needed)" if missing else default_text(_value(parent, name))))
     widths = [
         max(len(leaf.key) for leaf, _ in rows),
         min(max(len(default) for _, default in rows), 12),
@@ -77,7 +62,7 @@ def recipe_help(recipe: Recipe, config: type[Any], texts: Sequence[str] = ()) ->
         page += ["", title]
         for leaf, default in rows:
             if (leaf.key.partition(".")[0] if "." in leaf.key else "") == part:
-                page += _row([leaf.key, default], widths, _line(leaf), width)
+                page += _row([leaf.key, default], widths, leaf.line, width)
     page += ["", "Several values, such as seed=0,1,2, run one after another with -m."]
     return "\n".join(page)
 

@@ -25,13 +25,23 @@ class Leaf:
 
     @property
     def help(self) -> str:
-        """The line that ``--help`` shows."""
+        """What the knob is, in a line."""
         return self.metadata.get("help", "")
 
     @property
     def choices(self) -> tuple[str, ...] | None:
         """The only texts allowed, None where any is."""
         return self.metadata.get("choices")
+
+    @property
+    def line(self) -> str:
+        """The line that ``--help`` shows: the help, and the choices.
+
+        Examples:
+            >>> Leaf("form", str, {"help": "form of the reward", "choices": ("a", "b")}).line
+            'form of the reward {a, b}'
+        """
+        return self.help + (f" {{{', '.join(self.choices)}}}" if self.choices else "")
 
     @property
     def optional(self) -> bool:
@@ -54,6 +64,20 @@ class Leaf:
         else:
             words = _WORDS.get(kind, getattr(kind, "__name__", str(kind)))
         return words + (" or null" if self.optional else "")
+
+
+def default_text(value: Any) -> str:
+    """A knob's default as ``--help`` shows it.
+
+    Examples:
+        >>> default_text(None), default_text(True), default_text([64, 64]), default_text("???")
+        ('null', 'true', '[64,64]', '(needed)')
+    """
+    if value == "???":
+        return "(needed)"
+    if isinstance(value, bool):
+        return str(value).lower()
+    return "null" if value is None else str(value).replace(" ", "")
 
 
 def leaves(config: type[Any], prefix: str = "") -> Iterator[Leaf]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from giril_rl.errors import UserError
-from giril_rl.schema import leaves
+from giril_rl.schema import default_text, leaves
 from giril_rl.study.config import StudyConfig
 from giril_rl.study.spec import read_spec, shipped_studies
 
@@ -29,10 +29,7 @@ def study_help() -> str:
     page += ["", "Settings (key, default, meaning)"]
     default = StudyConfig()
     for leaf in leaves(StudyConfig):
-        value = getattr(default, leaf.key)
-        choices = f" {{{', '.join(leaf.choices)}}}" if leaf.choices else ""
-        page.append(
-            f"  {leaf.key:<11}  {'null' if value is None else value!s:<5}  {leaf.help}{choices}"
-        )
+        value = default_text(getattr(default, leaf.key))
+        page.append(f"  {leaf.key:<11}  {value:<5}  {leaf.line}")
     page.append("Any other key=value takes the place of that knob in all groups, such as seed=0,1.")
     return "\n".join(page)
