@@ -8,7 +8,7 @@ from textwrap import wrap
 
 from giril_rl.report.drawing import new_figure, save
 from giril_rl.report.formats import budget_text, seeds_text
-from giril_rl.report.rows import Panel, Row
+from giril_rl.report.rows import Panel, Row, longest
 from giril_rl.report.style import CONTROL, DEMONSTRATION, EXPERT, GREY, look
 
 
@@ -20,14 +20,9 @@ def comparable(panels: Sequence[Panel]) -> list[tuple[Panel, float, list[Row]]]:
     found = []
     for panel in panels:
         score = panel.reference("demo")
-        rows: dict[str, Row] = {}
-        for row in panel.main:
-            if row.method != "expert" and (
-                row.name not in rows or row.steps > rows[row.name].steps
-            ):
-                rows[row.name] = row
+        rows = longest(panel.main)
         if score is not None and score > 0 and rows:
-            found.append((panel, score, list(rows.values())))
+            found.append((panel, score, rows))
     return found
 
 

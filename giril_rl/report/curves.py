@@ -12,7 +12,7 @@ import numpy as np
 from giril_rl.report.curve import curve_points
 from giril_rl.report.drawing import new_figure, save, thousands
 from giril_rl.report.formats import budget_text, seeds_text
-from giril_rl.report.rows import Panel, Row
+from giril_rl.report.rows import Panel, Row, longest
 from giril_rl.report.statistics import band
 from giril_rl.report.style import DEMONSTRATION, EXPERT, PALETTE, Look, look
 from giril_rl.report.tables import Table
@@ -79,7 +79,7 @@ def draw_results(table: Table, path: Path) -> bool:
     Returns:
         Whether there was a curve to draw.
     """
-    rows = _longest([line.row for line in table.lines if line.row.method != "expert"])
+    rows = longest(line.row for line in table.lines)
     parts = [
         ("methods", [row for row in rows if not row.is_control]),
         ("controls", [row for row in rows if row.is_control]),
@@ -129,15 +129,6 @@ def draw_varied(table: Table, path: Path) -> bool:
     return _draw(table.panel, parts, [line.row for line in table.lines], path, about=table.title)
 
 
-def _longest(rows: Sequence[Row]) -> list[Row]:
-    """Of each method, the row with the largest budget."""
-    longest: dict[str, Row] = {}
-    for row in rows:
-        if row.name not in longest or row.steps > longest[row.name].steps:
-            longest[row.name] = row
-    return list(longest.values())
-
-
 def _draw(
     panel: Panel,
     parts: Sequence[tuple[str, Sequence[Row], Sequence[str], Sequence[Look]]],
@@ -150,8 +141,8 @@ def _draw(
         return False
     columns = 2 if len(parts) == 4 else min(len(parts), 3)
     lines = -(-len(parts) // columns)
-    longest = max(len(label) for _, _, labels, _ in parts for label in labels)
-    ncols = 1 if longest > 36 else 2
+    widest = max(len(label) for _, _, labels, _ in parts for label in labels)
+    ncols = 1 if widest > 36 else 2
     entries = max(sum(len(wrap(x, LEGEND)) for x in labels) for _, _, labels, _ in parts) + 2
     figure = new_figure(6.2 * columns, (4.6 + 0.2 * -(-entries // ncols)) * lines + 0.4)
     grid = figure.subplots(lines, columns, squeeze=False, sharey=True, sharex=True).flatten()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -77,6 +77,11 @@ class Row:
         return [float(mode["return_mean"]) for mode in found if mode] if all(found) else []
 
     @property
+    def mode_mean(self) -> float | None:
+        """Mean of :attr:`modes`, None where there are none."""
+        return sum(self.modes) / len(self.modes) if self.modes else None
+
+    @property
     def trained_steps(self) -> list[int]:
         """Environment steps that the runs took: fewer than the budget for an early stop or BC."""
         return sorted({int(result["env_steps"]) for result in self.results})
@@ -105,6 +110,20 @@ def _numeric(text: str) -> tuple[float, str]:
         return float(text), ""
     except ValueError:
         return float("inf"), text
+
+
+def longest(rows: Iterable[Row]) -> list[Row]:
+    """Of each method but the expert, the row with the largest budget.
+
+    Examples:
+        >>> [row.steps for row in longest([Row("bc", None, (), 10), Row("bc", None, (), 20)])]
+        [20]
+    """
+    found: dict[str, Row] = {}
+    for row in rows:
+        if row.method != "expert" and (row.name not in found or row.steps > found[row.name].steps):
+            found[row.name] = row
+    return list(found.values())
 
 
 @dataclass

@@ -77,7 +77,7 @@ def _averaging_follows(run: RunRecord, key: str, value: Any) -> bool:
     """Whether ``batch_mean`` is only what the profile says."""
     if key != "batch_mean":
         return False
-    return uses_profile(run) is False or value == (run.config.get("profile") == "released")
+    return not uses_profile(run) or value == (run.config.get("profile") == "released")
 
 
 def uses_profile(run: RunRecord) -> bool:
