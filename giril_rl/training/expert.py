@@ -136,7 +136,7 @@ def obtain_demonstration(
         return _given_demonstration(cfg.task, demo.path), None
     source, result = obtain_expert(cfg, expert)
     settings = {k: v for k, v in asdict(demo).items() if k not in ("path", "subsample")}
-    task = without_added({"task": asdict(with_own_episodes(cfg.task))})["task"]
+    task = without_added(asdict(with_own_episodes(cfg.task)), "task.")
     identity = json.dumps([settings, task, result["config_hash"]], sort_keys=True)
     digest = hashlib.sha256(identity.encode()).hexdigest()[:12]
     folder = Path(cfg.root) / "demos" / safe(cfg.task.name) / digest
