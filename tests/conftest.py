@@ -1,4 +1,6 @@
-"""A Gymnasium environment small enough to know by heart, and quick to run."""
+"""A Gymnasium environment small enough to know by heart, and signals as tests expect them."""
+
+import signal
 
 import gymnasium
 import numpy as np
@@ -40,6 +42,17 @@ class StepCounter(gymnasium.Env):
 
 if "StepCounter-v0" not in gymnasium.registry:
     gymnasium.register("StepCounter-v0", entry_point=StepCounter, max_episode_steps=10_000)
+
+
+@pytest.fixture(autouse=True)
+def heeded_ctrl_c():
+    """Tests send SIGINT, which a process that a script starts in the background ignores."""
+    before = signal.getsignal(signal.SIGINT)
+    if before is signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    if before is signal.SIG_IGN:
+        signal.signal(signal.SIGINT, before)
 
 
 @pytest.fixture
