@@ -12,6 +12,7 @@ from omegaconf import OmegaConf
 from giril_rl.compose import compose, groups
 from giril_rl.recipes import Recipe
 from giril_rl.schema import default_text, leaves
+from giril_rl.task_defaults import task_defaults
 
 
 def _row(columns: Sequence[str], widths: Sequence[int], text: str, width: int) -> list[str]:
@@ -40,15 +41,21 @@ def recipe_help(recipe: Recipe, config: type[Any], texts: Sequence[str] = ()) ->
     for name, (choices, default) in groups(recipe).items():
         marked = [f"{choice} (default)" if choice == default else choice for choice in choices]
         page += _row([name], [8], ", ".join(marked), width)
-    page += _row([""], [8], "task.env_id=ID alone chooses the task gymnasium", width)
+    page += _row([""], [8], "task.env_id=ID alone chooses the task gymnasium or atari", width)
 
-    node = compose(recipe, config, texts).node
+    composed = compose(recipe, config, texts)
+    node = composed.node
+    missing = OmegaConf.is_missing(node.task, "env_id")
+    kind = {} if missing else task_defaults(node.task.env_id, composed.chosen)
     rows = []
     for leaf in leaves(config):
         parent = OmegaConf.select(node, leaf.key.rpartition(".")[0]) if "." in leaf.key else node
         name = leaf.key.rpartition(".")[2]
-        missing = OmegaConf.is_missing(parent, name)
-        rows.append((leaf, "(needed)" if missing else default_text(_value(parent, name))))
+        if OmegaConf.is_missing(parent, name):
+            rows.append((leaf, "(needed)"))
+        else:
+            value = kind[leaf.key] if leaf.key in kind else _value(parent, name)
+            rows.append((leaf, default_text(value)))
     widths = [
         max(len(leaf.key) for leaf, _ in rows),
         min(max(len(default) for _, default in rows), 12),

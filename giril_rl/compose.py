@@ -19,9 +19,12 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from giril_rl.configs import is_atari
 from giril_rl.errors import UserError
 from giril_rl.overrides import KeyCheck, check_settings, normalised, parse
 from giril_rl.recipes import Recipe, shipped_conf
+from giril_rl.schema import flat
+from giril_rl.task_defaults import apply_task_defaults
 
 SCHEMA = "recipe_schema"
 """The entry in a YAML's defaults list that stands for the recipe's own ``Config`` class."""
@@ -34,13 +37,20 @@ class Composed:
     Attributes:
         node: Hydra's result, of the recipe's ``Config`` type.
         changes: the user's overrides as ``{key: "key=value"}`` in one spelling.
+        written: dotted keys that the recipe's own YAML sets.
     """
 
     node: DictConfig
     changes: dict[str, str]
+    written: frozenset[str] = frozenset()
+
+    @property
+    def chosen(self) -> frozenset[str]:
+        """Dotted keys that somebody chose, who then wins over the kind of task."""
+        return self.written | self.changes.keys()
 
     def config(self) -> Any:
-        """The instance of ``Config`` with every interpolation resolved.
+        """The instance of ``Config`` with every interpolation resolved, for its kind of task.
 
         Raises:
             UserError: where a mandatory value is missing or an interpolation leads nowhere.
@@ -50,10 +60,11 @@ class Composed:
             raise UserError(f"{key} has no value: give one, such as {key}={hint}.")
         try:
             OmegaConf.resolve(self.node)
-            return OmegaConf.to_object(self.node)
+            built = OmegaConf.to_object(self.node)
         except OmegaConfBaseException as error:
             where = f"{error.full_key}: " if error.full_key else ""
             raise UserError(f"{where}{_first_line(error)}.") from error
+        return apply_task_defaults(built, self.chosen)
 
 
 def _missing(values: Any, prefix: str = "") -> Iterator[str]:
@@ -105,16 +116,18 @@ def groups(recipe: Recipe) -> dict[str, tuple[list[str], str]]:
 
 
 def _with_task(texts: Sequence[str]) -> list[str]:
-    keys = [text.partition("=")[0] for text in texts]
-    if "task.env_id" in keys and "task" not in keys:
-        return ["task=gymnasium", *texts]
+    given = dict(text.partition("=")[::2] for text in texts)
+    if "task.env_id" in given and "task" not in given:
+        kind = "atari" if is_atari(given["task.env_id"].strip("'\"")) else "gymnasium"
+        return [f"task={kind}", *texts]
     return list(texts)
 
 
 def compose(recipe: Recipe, config: type[Any], texts: Sequence[str]) -> Composed:
     """Compose one configuration; values may still be missing or interpolations.
 
-    ``task.env_id=X`` without ``task=`` chooses the task ``gymnasium``, named after the environment.
+    ``task.env_id=X`` without ``task=`` chooses the task ``gymnasium``, or ``atari`` for an id like
+    ``ALE/Pong-v5``, named after the environment.
 
     Args:
         recipe: whose YAML is the primary configuration.
@@ -150,7 +163,8 @@ def compose(recipe: Recipe, config: type[Any], texts: Sequence[str]) -> Composed
         cause = error.__cause__ if isinstance(error.__cause__, Exception) else error
         raise UserError(f"{recipe.yaml} cannot be composed: {_first_line(cause)}.") from error
     changes = {override.get_key_element(): normalised(override) for override in overrides}
-    return Composed(node, changes)
+    written = flat({key: value for key, value in settings.items() if key != "defaults"})
+    return Composed(node, changes, frozenset(written))
 
 
 def _quoted(text: str) -> str:

@@ -56,6 +56,16 @@ def knob(
     return field(default=default, metadata=metadata)
 
 
+def is_atari(env_id: str) -> bool:
+    """Whether a Gymnasium id is one of the Arcade Learning Environment.
+
+    Examples:
+        >>> is_atari("ALE/Pong-v5"), is_atari("Pendulum-v1")
+        (True, False)
+    """
+    return env_id.startswith("ALE/")
+
+
 @dataclass
 class TaskConfig:
     """The environment and what is known about it."""
@@ -89,7 +99,7 @@ class TaskConfig:
     @property
     def is_atari(self) -> bool:
         """Whether the environment is one of the Arcade Learning Environment."""
-        return self.env_id.startswith("ALE/")
+        return is_atari(self.env_id)
 
 
 @dataclass
@@ -174,7 +184,7 @@ class GenerativeConfig:
     normalise: str = knob(
         "standardise",
         "observation rule of the reward model",
-        choices=("demo_range", "standardise", "raw"),
+        choices=("demo_range", "standardise", "raw", "pixels"),
     )
     clamp: bool = knob(True, "clamp normalised observations to [-1, 1]")
     hidden: list[int] = knob([100, 100], "hidden layers of encoder and decoder (tanh)", low=1)
@@ -197,7 +207,7 @@ class AdversarialConfig:
     normalise: str = knob(
         "standardise",
         "observation rule: running statistics of the policy, or one of the demonstration",
-        choices=("running", "demo_range", "standardise", "raw"),
+        choices=("running", "demo_range", "standardise", "raw", "pixels"),
     )
     clamp: float | None = knob(
         10.0, "bound on normalised observations; null has none", low=0, low_open=True
@@ -230,7 +240,7 @@ class CuriosityConfig:
     normalise: str = knob(
         "standardise",
         "observation rule of the reward model",
-        choices=("demo_range", "standardise", "raw"),
+        choices=("demo_range", "standardise", "raw", "pixels"),
     )
     clamp: bool = knob(True, "clamp normalised observations to [-1, 1]")
     hidden: list[int] = knob([100, 100], "layers of the features (tanh); [] takes none", low=1)

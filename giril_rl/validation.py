@@ -18,6 +18,7 @@ from giril_rl.configs import (
 )
 from giril_rl.errors import UserError
 from giril_rl.schema import leaves
+from giril_rl.task_defaults import apply_task_defaults
 
 
 def _show(value: Any) -> str:
@@ -63,6 +64,10 @@ def _check_steps(key: str, steps: int, ppo: PPOConfig) -> None:
 
 
 def _check_task(key: str, task: TaskConfig) -> None:
+    if task.is_atari and task.horizon != "own":
+        raise UserError(
+            f"{key}.horizon={task.horizon} is for vector tasks: leave {key}.horizon=own."
+        )
     if task.after_failure != "reset" and task.horizon == "own":
         raise UserError(
             f"{key}.after_failure={task.after_failure} means nothing where a failure ends the "
@@ -106,7 +111,8 @@ def _check_run(config: Any) -> None:
     if isinstance(expert, ExpertConfig) and expert.path is None:
         # The expert that another recipe trains has the settings of PPO that are the default.
         key = "task.expert_steps" if expert.steps is None else "expert.steps"
-        _check_steps(key, expert.steps_on(config.task), PPOConfig())
+        ppo = apply_task_defaults(ExpertRunConfig(task=config.task)).ppo
+        _check_steps(key, expert.steps_on(config.task), ppo)
 
 
 def _check_demo(key: str, demo: DemoConfig) -> None:

@@ -8,7 +8,7 @@ from giril_rl.errors import UserError
 from giril_rl.naming import config_hash, out_folder, safe, variant
 from giril_rl.overrides import sweep
 from giril_rl.recipe_config import config_class
-from giril_rl.recipes import find, shipped
+from giril_rl.recipes import copy, find, shipped
 
 GIRIL = find("giril")
 CONFIG = config_class(GIRIL)
@@ -71,11 +71,31 @@ def test_profiles(profile, mean):
 
 
 def test_an_environment_alone_chooses_the_gymnasium_task():
-    config = config_of("task.env_id=ALE/Pong-v5")
-    assert (config.task.name, config.task.env_id) == ("ALE/Pong-v5", "ALE/Pong-v5")
+    config = config_of("task.env_id=my/Reach-v5")
+    assert (config.task.name, config.task.env_id) == ("my/Reach-v5", "my/Reach-v5")
     assert config.task.expert_score is None
     kept = config_of("task=inverted_pendulum", "task.env_id=Other-v0").task
     assert (kept.name, kept.env_id) == ("inverted_pendulum", "Other-v0")
+
+
+def test_atari_has_settings_of_its_own_that_lose_against_the_users():
+    config = config_of("task.env_id=ALE/Pong-v5", "demo.subsample=2")
+    assert (config.task.name, config.task.steps) == ("ALE/Pong-v5", 49_999_872)
+    assert (config.ppo.num_envs, config.ppo.rollout, config.ppo.anneal_lr) == (8, 128, True)
+    assert config.ppo.entropy_coef == 0.01 and config.ppo.clip_value
+    assert (config.demo.length, config.demo.episodes, config.demo.subsample) == (None, 1, 2)
+    assert config.reward.normalise == "pixels"
+    vector = config_of("task=inverted_pendulum")
+    assert (vector.ppo.num_envs, vector.ppo.clip_value, vector.demo.length) == (16, False, 1000)
+    assert config_of("task=breakout").task.steps % (8 * 128) == 0
+
+
+def test_a_recipes_own_yaml_wins_over_the_kind_of_task(tmp_path):
+    file, settings = copy(find("giril"), tmp_path / "mine.py")
+    settings.write_text(settings.read_text() + "ppo: {rollout: 64}\n")
+    mine = find(str(file))
+    config, _ = resolved(mine, config_class(mine), ["task=breakout", "steps=1024"])
+    assert (config.ppo.rollout, config.ppo.num_envs) == (64, 8)
 
 
 @pytest.mark.parametrize("recipe", shipped(), ids=lambda recipe: recipe.name)
@@ -84,7 +104,8 @@ def test_every_shipped_recipe_composes_with_every_choice(recipe):
     for group, (names, default) in groups(recipe).items():
         assert default in names
         for name in names:
-            extra = ["task.env_id=Pendulum-v1"] if name == "gymnasium" else []
+            needed = {"gymnasium": "Pendulum-v1", "atari": "ALE/Pong-v5"}
+            extra = [f"task.env_id={needed[name]}"] if name in needed else []
             resolved(recipe, schema, [f"{group}={name}", *extra])
 
 
@@ -104,9 +125,9 @@ def test_every_shipped_recipe_composes_with_every_choice(recipe):
         (["hydra.x=1"], "'hydra.x' is not a key of giril: see `giril run giril --help`."),
         (
             ["task=foo"],
-            "task=foo: choose one of ant, gymnasium, half_cheetah, hopper, "
-            "inverted_double_pendulum, inverted_pendulum, inverted_pendulum_swingup, reacher, "
-            "walker2d.",
+            "task=foo: choose one of ant, atari, beam_rider, breakout, gymnasium, half_cheetah, "
+            "hopper, inverted_double_pendulum, inverted_pendulum, inverted_pendulum_swingup, "
+            "kung_fu_master, qbert, reacher, seaquest, space_invaders, walker2d.",
         ),
         (["profile=foo"], "profile=foo: choose one of paper, released."),
         (["seed=abc"], "seed=abc: a whole number is needed."),

@@ -137,14 +137,14 @@ def for_scores(task: TaskConfig) -> TaskConfig:
 
 
 def with_own_episodes(task: TaskConfig) -> TaskConfig:
-    """The task with its own episodes, which end at a failure: what experts play.
+    """The task with its own episodes, which end at a failure or a lost life: what experts play.
 
     Examples:
         >>> fixed = TaskConfig(name="cartpole", env_id="CartPole-v1", horizon="fixed")
         >>> with_own_episodes(fixed).horizon
         'own'
     """
-    return replace(task, horizon="own", after_failure="reset")
+    return replace(task, horizon="own", after_failure="reset", episode="life")
 
 
 def _import(package: str, extra: str | None = None) -> None:

@@ -14,7 +14,7 @@ from typing import Any
 from filelock import FileLock, Timeout
 from tensordict import TensorDict
 from torch import Tensor
-from torchrl.envs import Compose
+from torchrl.envs import Compose, SignTransform
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from giril_rl.configs import DemoConfig, ExpertConfig, ExpertRunConfig, RunConfig, TaskConfig
@@ -23,12 +23,15 @@ from giril_rl.envs import gym_factory, make_env, with_own_episodes
 from giril_rl.errors import UserError
 from giril_rl.naming import out_folder, safe, without_added
 from giril_rl.networks.policy import ActorCritic
+from giril_rl.task_defaults import apply_task_defaults
 from giril_rl.training.agent import load_agent, make_agent
 from giril_rl.training.finished import read_result, read_settings
 from giril_rl.training.ppo import train_ppo
 from giril_rl.training.result import finish_run
 from giril_rl.training.run import Run
 from giril_rl.training.scaling import return_scaling
+
+REWARD = [("next", "reward")]
 
 
 def train_expert(cfg: ExpertRunConfig, folder: Path) -> dict[str, Any]:
@@ -49,11 +52,12 @@ def train_expert(cfg: ExpertRunConfig, folder: Path) -> dict[str, Any]:
         if run.result is not None:
             return run.result
         env = make_env(cfg.task, cfg.ppo.num_envs, cfg.seed)
+        scaling = return_scaling(cfg.scaling, cfg.ppo.gamma)
         agent = make_agent(env, cfg.ppo, cfg.seed)
         trained = train_ppo(
             env,
             agent,
-            Compose(*return_scaling(cfg.scaling, cfg.ppo.gamma)),
+            Compose(*([SignTransform(REWARD)] if cfg.clip_reward else scaling)),
             cfg.ppo,
             steps=cfg.steps,
             seed=cfg.seed,
@@ -82,14 +86,16 @@ def obtain_expert(cfg: RunConfig, expert: ExpertConfig) -> tuple[Path, dict[str,
                 "choose an expert of the same task."
             )
         return folder, result
-    settings = ExpertRunConfig(
-        task=with_own_episodes(cfg.task),
-        root=cfg.root,
-        logger=cfg.logger,
-        threads=cfg.threads,
-        steps=expert.steps_on(cfg.task),
-        seed=expert.seed,
-        stop_early=expert.stop_early,
+    settings = apply_task_defaults(
+        ExpertRunConfig(
+            task=with_own_episodes(cfg.task),
+            root=cfg.root,
+            logger=cfg.logger,
+            threads=cfg.threads,
+            steps=expert.steps_on(cfg.task),
+            seed=expert.seed,
+            stop_early=expert.stop_early,
+        )
     )
     folder = out_folder("expert", settings, {})
     with made_once(folder, "expert"):

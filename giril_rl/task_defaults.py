@@ -1,0 +1,72 @@
+"""Settings that a kind of task changes in every recipe: Atari's."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import is_dataclass
+from functools import cache
+from typing import Any
+
+import yaml
+
+from giril_rl.configs import is_atari
+from giril_rl.recipes import shipped_conf
+from giril_rl.schema import flat
+
+
+@cache
+def _atari() -> dict[str, Any]:
+    text = (shipped_conf() / "atari.yaml").read_text(encoding="utf-8")
+    return flat(yaml.safe_load(text))
+
+
+def task_defaults(env_id: str, chosen: Collection[str] = ()) -> dict[str, Any]:
+    """What a task's kind changes, by dotted key, less what somebody chose.
+
+    Args:
+        env_id: the task's Gymnasium id.
+        chosen: dotted keys to leave out, also all those below them.
+
+    Examples:
+        >>> task_defaults("ALE/Pong-v5")["ppo.num_envs"], task_defaults("Pendulum-v1")
+        (8, {})
+    """
+    if not is_atari(env_id):
+        return {}
+    return {
+        key: value
+        for key, value in _atari().items()
+        if not any(key == one or key.startswith(f"{one}.") for one in chosen)
+    }
+
+
+def apply_task_defaults(config: Any, chosen: Collection[str] = ()) -> Any:
+    """Gives a recipe's ``Config`` the values of :func:`task_defaults`.
+
+    Keys that the recipe does not have are passed over, and so are those that somebody chose.
+
+    Args:
+        config: an instance of a recipe's ``Config``, or of any part of one that has a task; changed
+            in place.
+        chosen: see :func:`task_defaults`.
+
+    Returns:
+        ``config``.
+
+    Examples:
+        >>> from giril_rl.configs import RunConfig, TaskConfig
+        >>> config = RunConfig(task=TaskConfig(name="pong", env_id="ALE/Pong-v5"))
+        >>> config = apply_task_defaults(config, chosen=["ppo.rollout"])
+        >>> config.ppo.num_envs, config.ppo.rollout
+        (8, 125)
+    """
+    for key, value in task_defaults(config.task.env_id, chosen).items():
+        *parts, name = key.split(".")
+        part = config
+        for step in parts:
+            part = getattr(part, step, None)
+            if not is_dataclass(part):
+                break
+        if is_dataclass(part) and hasattr(part, name):
+            setattr(part, name, value)
+    return config
