@@ -1,0 +1,145 @@
+"""PPO's policy and value network for pixels, one trunk under both heads."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
+from torch import Tensor, nn
+from torchrl.envs.utils import ExplorationType, exploration_type
+
+from giril_rl.networks.distributions import CategoricalActions
+from giril_rl.networks.pixels import flat_frames
+
+HIDDEN = "hidden"
+
+
+class PixelActorCritic(nn.Module):
+    """Three convolutions and a layer of 512 under a categorical policy and a value.
+
+    8x8 of stride 4 to 32 channels, 4x4 of stride 2 to 64, 3x3 to 32, then 512, each with ReLU, on
+    frames divided by 255 (the released code's policy). Orthogonal initialisation with gain
+    sqrt(2), the policy's head 0.01, the value's 1.
+
+    The interface is that of :class:`~giril_rl.networks.policy.ActorCritic`. In PPO's loss the actor
+    leaves the trunk's output as ``"hidden"`` for the critic, so that the trunk runs once.
+
+    Args:
+        actions: |A|.
+        channels: frames in an observation.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> agent = PixelActorCritic(6)
+        >>> frames = torch.zeros(3, 4, 84, 84, dtype=torch.uint8)
+        >>> agent.acting()(TensorDict({"observation": frames}, [3]))["action"].shape
+        torch.Size([3])
+    """
+
+    discrete = True
+    input_keys: tuple[str, ...] = ("observation",)
+    """What the networks in the loss read of a minibatch."""
+
+    def __init__(self, actions: int, channels: int = 4) -> None:
+        super().__init__()
+        self.channels = channels
+        self.normaliser = nn.Identity()
+        self.trunk = nn.Sequential(
+            nn.Conv2d(channels, 32, 8, stride=4),
+            nn.ReLU(),
+            nn.Conv2d(32, 64, 4, stride=2),
+            nn.ReLU(),
+            nn.Conv2d(64, 32, 3),
+            nn.ReLU(),
+            nn.Flatten(),
+            nn.Linear(32 * 7 * 7, 512),
+            nn.ReLU(),
+        )
+        self.actor = nn.Linear(512, actions)
+        self.critic = nn.Linear(512, 1)
+        for layer in self.trunk:
+            if isinstance(layer, (nn.Conv2d, nn.Linear)):
+                _orthogonal(layer, math.sqrt(2))
+        _orthogonal(self.actor, 0.01)
+        _orthogonal(self.critic, 1.0)
+
+    def hidden(self, observation: Tensor) -> Tensor:
+        """The trunk's output ``(*batch, 512)`` for uint8 frames ``(*batch, channels, 84, 84)``."""
+        frames = flat_frames(observation, self.channels).to(self.actor.weight.dtype) / 255
+        return self.trunk(frames).reshape(*observation.shape[:-3], 512)
+
+    def distribution_and_value(self, observation: Tensor) -> tuple[CategoricalActions, Tensor]:
+        """The action distribution and the value ``(*batch, 1)`` of uint8 frames, trunk run once."""
+        hidden = self.hidden(observation)
+        return CategoricalActions(self.actor(hidden)), self.critic(hidden)
+
+    def update_normaliser(self, observation: Tensor) -> None:
+        """Does nothing: frames are divided by a constant."""
+
+    def acting(self) -> PixelActingPolicy:
+        """The module that acts in an environment; shares this one's parameters."""
+        return PixelActingPolicy(self)
+
+    def actor_for_loss(self) -> PixelLossActor:
+        """The module that gives :class:`torchrl.objectives.ClipPPOLoss` its distribution."""
+        return PixelLossActor(self)
+
+    def critic_for_loss(self) -> TensorDictModule:
+        """The value's head on what :meth:`actor_for_loss` left, writing ``"state_value"``."""
+        return TensorDictModule(self.critic, in_keys=[HIDDEN], out_keys=["state_value"])
+
+
+class PixelActingPolicy(TensorDictModuleBase):
+    """Samples an action, or takes the mode under ``ExplorationType.DETERMINISTIC``.
+
+    Reads ``"observation"``; writes ``"action"``, ``"action_log_prob"`` and ``"state_value"``, which
+    advantages and the clipped value loss read again.
+    """
+
+    def __init__(self, agent: PixelActorCritic) -> None:
+        super().__init__()
+        self.in_keys = ["observation"]
+        self.out_keys = ["action", "action_log_prob", "state_value"]
+        self.agent = agent
+
+    @torch.no_grad()
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes the action for ``"observation"`` of any leading shape."""
+        distribution, value = self.agent.distribution_and_value(tensordict.get("observation"))
+        greedy = exploration_type() == ExplorationType.DETERMINISTIC
+        action = distribution.mode if greedy else distribution.sample()
+        tensordict.set("action", action)
+        tensordict.set("action_log_prob", distribution.log_prob(action))
+        return tensordict.set("state_value", value)
+
+
+class PixelLossActor(TensorDictModuleBase):
+    """Gives the action distribution, and leaves the trunk's output for the critic."""
+
+    def __init__(self, agent: PixelActorCritic) -> None:
+        super().__init__()
+        self.in_keys = ["observation"]
+        self.out_keys = ["action", HIDDEN]
+        self.agent = agent
+
+    def get_dist(self, tensordict: TensorDictBase) -> CategoricalActions:
+        """The distribution that the loss evaluates the recorded actions under.
+
+        Writes ``"hidden"`` into ``tensordict``, which in the loss is its own shallow copy of the
+        minibatch, the one that the critic gets next.
+        """
+        hidden = self.agent.hidden(tensordict.get("observation"))
+        tensordict.set(HIDDEN, hidden)
+        return CategoricalActions(self.agent.actor(hidden))
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes the distribution's mode as the action."""
+        return tensordict.set("action", self.get_dist(tensordict).mode)
+
+
+def _orthogonal(layer: nn.Conv2d | nn.Linear, gain: float) -> None:
+    nn.init.orthogonal_(layer.weight, gain)
+    if layer.bias is not None:
+        nn.init.zeros_(layer.bias)
