@@ -39,41 +39,43 @@ class PixelActorCritic(nn.Module):
     """
 
     discrete = True
+    log_std = None
     input_keys: tuple[str, ...] = ("observation",)
-    """What the networks in the loss read of a minibatch."""
+    """What the networks in PPO's loss read of a minibatch."""
 
     def __init__(self, actions: int, channels: int = 4) -> None:
         super().__init__()
-        self.channels = channels
         self.normaliser = nn.Identity()
-        self.trunk = nn.Sequential(
-            nn.Conv2d(channels, 32, 8, stride=4),
-            nn.ReLU(),
-            nn.Conv2d(32, 64, 4, stride=2),
-            nn.ReLU(),
-            nn.Conv2d(64, 32, 3),
-            nn.ReLU(),
-            nn.Flatten(),
-            nn.Linear(32 * 7 * 7, 512),
-            nn.ReLU(),
-        )
-        self.actor = nn.Linear(512, actions)
+        self.actor = PixelActor(actions, channels)
         self.critic = nn.Linear(512, 1)
-        for layer in self.trunk:
-            if isinstance(layer, (nn.Conv2d, nn.Linear)):
-                _orthogonal(layer, math.sqrt(2))
-        _orthogonal(self.actor, 0.01)
         _orthogonal(self.critic, 1.0)
 
     def hidden(self, observation: Tensor) -> Tensor:
         """The trunk's output ``(*batch, 512)`` for uint8 frames ``(*batch, channels, 84, 84)``."""
-        frames = flat_frames(observation, self.channels).to(self.actor.weight.dtype) / 255
-        return self.trunk(frames).reshape(*observation.shape[:-3], 512)
+        return self.actor.hidden(observation)
 
     def distribution_and_value(self, observation: Tensor) -> tuple[CategoricalActions, Tensor]:
         """The action distribution and the value ``(*batch, 1)`` of uint8 frames, trunk run once."""
         hidden = self.hidden(observation)
-        return CategoricalActions(self.actor(hidden)), self.critic(hidden)
+        return CategoricalActions(self.actor.head(hidden)), self.critic(hidden)
+
+    def value_network(self) -> None:
+        """None: the acting policy has written the values, and :meth:`look_ahead` the next ones."""
+
+    @torch.no_grad()
+    def look_ahead(self, batch: TensorDictBase, following: Tensor) -> None:
+        """Writes the value of what follows each step, which mostly is that of the next one.
+
+        Args:
+            batch: what the acting policy collected, ``(num_envs, time)``, with ``"state_value"``.
+            following: the observation that follows each step, uint8 ``(num_envs, time, ...)``.
+        """
+        value = batch.get("state_value")
+        after = value.roll(-1, 1)
+        alone = batch.get(("next", "done")).squeeze(-1).clone()
+        alone[:, -1] = True
+        after[alone] = self.critic(self.hidden(following[alone]))
+        batch.set(("next", "state_value"), after)
 
     def update_normaliser(self, observation: Tensor) -> None:
         """Does nothing: frames are divided by a constant."""
@@ -89,6 +91,48 @@ class PixelActorCritic(nn.Module):
     def critic_for_loss(self) -> TensorDictModule:
         """The value's head on what :meth:`actor_for_loss` left, writing ``"state_value"``."""
         return TensorDictModule(self.critic, in_keys=[HIDDEN], out_keys=["state_value"])
+
+
+class PixelActor(nn.Module):
+    """The trunk and the policy's head: uint8 frames to logits, what behaviour cloning fits.
+
+    Args:
+        actions: |A|.
+        channels: frames in an observation.
+
+    Examples:
+        >>> PixelActor(6)(torch.zeros(3, 4, 84, 84, dtype=torch.uint8)).shape
+        torch.Size([3, 6])
+    """
+
+    def __init__(self, actions: int, channels: int = 4) -> None:
+        super().__init__()
+        self.channels = channels
+        self.trunk = nn.Sequential(
+            nn.Conv2d(channels, 32, 8, stride=4),
+            nn.ReLU(),
+            nn.Conv2d(32, 64, 4, stride=2),
+            nn.ReLU(),
+            nn.Conv2d(64, 32, 3),
+            nn.ReLU(),
+            nn.Flatten(),
+            nn.Linear(32 * 7 * 7, 512),
+            nn.ReLU(),
+        )
+        self.head = nn.Linear(512, actions)
+        for layer in self.trunk:
+            if isinstance(layer, (nn.Conv2d, nn.Linear)):
+                _orthogonal(layer, math.sqrt(2))
+        _orthogonal(self.head, 0.01)
+
+    def hidden(self, observation: Tensor) -> Tensor:
+        """The trunk's output ``(*batch, 512)`` for uint8 frames ``(*batch, channels, 84, 84)``."""
+        frames = flat_frames(observation, self.channels).to(self.head.weight.dtype) / 255
+        return self.trunk(frames).reshape(*observation.shape[:-3], 512)
+
+    def forward(self, observation: Tensor) -> Tensor:
+        """The logits ``(*batch, actions)``."""
+        return self.head(self.hidden(observation))
 
 
 class PixelActingPolicy(TensorDictModuleBase):
@@ -132,7 +176,7 @@ class PixelLossActor(TensorDictModuleBase):
         """
         hidden = self.agent.hidden(tensordict.get("observation"))
         tensordict.set(HIDDEN, hidden)
-        return CategoricalActions(self.agent.actor(hidden))
+        return CategoricalActions(self.agent.actor.head(hidden))
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the distribution's mode as the action."""

@@ -41,6 +41,9 @@ class ActorCritic(nn.Module):
         torch.Size([3])
     """
 
+    input_keys: tuple[str, ...] = (NORMALISED,)
+    """What the networks in PPO's loss read of a minibatch."""
+
     def __init__(
         self,
         observation_size: int,
@@ -68,6 +71,19 @@ class ActorCritic(nn.Module):
         """Merges raw observations into the running statistics, if there are any."""
         if isinstance(self.normaliser, RunningNormaliser):
             self.normaliser.update(observation)
+
+    def value_network(self) -> TensorDictModule:
+        """What advantages have the values computed by, in a batch and where it leads to."""
+        return self.critic_for_loss()
+
+    def look_ahead(self, batch: TensorDictBase, following: Tensor) -> None:
+        """Writes into ``batch`` what :meth:`value_network` reads of where each step leads to.
+
+        Args:
+            batch: what the acting policy collected, ``(num_envs, time)``.
+            following: the observation that follows each step.
+        """
+        batch.set(("next", NORMALISED), self.normaliser(following))
 
     def acting(self) -> ActingPolicy:
         """The module that acts in an environment; shares this one's parameters."""

@@ -9,13 +9,13 @@ import torch
 from giril_rl.configs import PPOConfig, TaskConfig
 from giril_rl.envs import BatchedEnv, make_env
 from giril_rl.errors import UserError
-from giril_rl.networks.policy import ActorCritic
+from giril_rl.networks.agents import Agent, agent_for
 from giril_rl.training.checkpoint import load_state, save_state
 
 POLICY_FILE = "policy.safetensors"
 
 
-def make_agent(env: BatchedEnv, cfg: PPOConfig, seed: int) -> ActorCritic:
+def make_agent(env: BatchedEnv, cfg: PPOConfig, seed: int) -> Agent:
     """An untrained agent for ``env``, initialised from ``seed`` alone.
 
     Examples:
@@ -26,20 +26,15 @@ def make_agent(env: BatchedEnv, cfg: PPOConfig, seed: int) -> ActorCritic:
     """
     with torch.random.fork_rng(devices=[]):
         torch.default_generator.manual_seed(seed)
-        return ActorCritic(
-            env.observation_spec["observation"].shape[-1],
-            env.action_spec,
-            hidden=cfg.hidden,
-            normalise=cfg.normalise_observations,
-        )
+        return agent_for(env, hidden=cfg.hidden, normalise=cfg.normalise_observations)
 
 
-def save_agent(agent: ActorCritic, folder: Path) -> None:
+def save_agent(agent: Agent, folder: Path) -> None:
     """Writes ``policy.safetensors`` into a run's folder."""
     save_state(folder / POLICY_FILE, dict(agent.state_dict()))
 
 
-def load_agent(folder: Path, task: TaskConfig, cfg: PPOConfig) -> ActorCritic:
+def load_agent(folder: Path, task: TaskConfig, cfg: PPOConfig) -> Agent:
     """The agent that :func:`save_agent` wrote.
 
     Raises:

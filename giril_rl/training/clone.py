@@ -14,8 +14,9 @@ from torchrl.objectives import BCLoss
 
 from giril_rl.configs import BCConfig
 from giril_rl.errors import UserError
+from giril_rl.networks.agents import Agent
 from giril_rl.networks.normalise import RunningNormaliser
-from giril_rl.networks.policy import NORMALISED, ActorCritic
+from giril_rl.networks.policy import NORMALISED
 from giril_rl.progress import progress
 from giril_rl.training.interrupt import Interrupt, Interrupted
 from giril_rl.training.ppo import Trained
@@ -27,7 +28,7 @@ CHECKPOINT_EVERY = 1_000
 
 
 def clone_behaviour(
-    agent: ActorCritic,
+    agent: Agent,
     fitted: TensorDictBase,
     cfg: BCConfig,
     *,
@@ -128,7 +129,7 @@ def clone_behaviour(
 
 
 @torch.no_grad()
-def set_deviation(agent: ActorCritic, pairs: TensorDictBase, least: float) -> None:
+def set_deviation(agent: Agent, pairs: TensorDictBase, least: float) -> None:
     """Gives Box actions the deviation that makes ``pairs`` likeliest, one for each dimension.
 
     Args:
@@ -138,6 +139,7 @@ def set_deviation(agent: ActorCritic, pairs: TensorDictBase, least: float) -> No
 
     Examples:
         >>> from torchrl.data import Bounded
+        >>> from giril_rl.networks.policy import ActorCritic
         >>> agent = ActorCritic(1, Bounded(-1, 1, shape=(1,)), hidden=())
         >>> agent.actor[-1].weight.data.fill_(1.0)
         tensor([[1.]])
@@ -153,7 +155,7 @@ def set_deviation(agent: ActorCritic, pairs: TensorDictBase, least: float) -> No
     agent.log_std.copy_(error.square().mean(0).sqrt().clamp(min=least).log())
 
 
-def _loss(agent: ActorCritic) -> BCLoss:
+def _loss(agent: Agent) -> BCLoss:
     """TorchRL's loss on what the network puts out: the mean action, or the actions' logits."""
     actor = TensorDictModule(agent.actor, in_keys=[NORMALISED], out_keys=["action"])
     with warnings.catch_warnings():
@@ -161,7 +163,7 @@ def _loss(agent: ActorCritic) -> BCLoss:
         return BCLoss(actor, loss_function="cross_entropy" if agent.discrete else "mse")
 
 
-def _pairs(agent: ActorCritic, data: TensorDictBase) -> TensorDict:
+def _pairs(agent: Agent, data: TensorDictBase) -> TensorDict:
     normalised = agent.normaliser(data.get("observation"))
     return TensorDict({NORMALISED: normalised, "action": data.get("action")}, data.shape)
 

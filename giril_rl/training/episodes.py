@@ -14,6 +14,9 @@ class EpisodeTracker(nn.Module):
     those steps count, so that returns and lengths are those of the task's own episodes: one for
     each horizon, from its beginning to the first failure.
 
+    Where it has ``("next", "game_over")`` (see :class:`giril_rl.envs.AtariEnv`), an episode is a
+    whole game, whatever ends one for the learner.
+
     Args:
         num_envs: environments in a batch.
 
@@ -42,7 +45,8 @@ class EpisodeTracker(nn.Module):
     def forward(self, batch: TensorDictBase) -> tuple[Tensor, Tensor]:
         """Takes a batch ``(num_envs, time)``; gives returns and lengths of episodes ended in it."""
         reward = batch.get(("next", "reward")).squeeze(-1).double()
-        done = batch.get(("next", "done")).squeeze(-1)
+        over = batch.get(("next", "game_over"), None)
+        done = (batch.get(("next", "done")) if over is None else over).squeeze(-1)
         scored = batch.get(("next", "scored"), None)
         if scored is None:
             time = torch.arange(1, done.shape[1] + 1).expand_as(done)

@@ -22,7 +22,7 @@ from giril_rl.demos import Demonstration, check_demonstration, record_demonstrat
 from giril_rl.envs import gym_factory, make_env, with_own_episodes
 from giril_rl.errors import UserError
 from giril_rl.naming import out_folder, safe, without_added
-from giril_rl.networks.policy import ActorCritic
+from giril_rl.networks.agents import Agent
 from giril_rl.task_defaults import apply_task_defaults
 from giril_rl.training.agent import load_agent, make_agent
 from giril_rl.training.finished import read_result, read_settings
@@ -163,7 +163,7 @@ def obtain_demonstration(
     return Demonstration.load(folder), result
 
 
-def _player(agent: ActorCritic, *, deterministic: bool) -> Any:
+def _player(agent: Agent, *, deterministic: bool) -> Any:
     policy = agent.acting()
     mode = ExplorationType.DETERMINISTIC if deterministic else ExplorationType.RANDOM
 

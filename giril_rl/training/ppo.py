@@ -17,7 +17,7 @@ from torchrl.objectives.value import GAE
 from giril_rl.configs import PPOConfig
 from giril_rl.envs import BatchedEnv
 from giril_rl.errors import UserError
-from giril_rl.networks.policy import NORMALISED, ActorCritic
+from giril_rl.networks.agents import Agent
 from giril_rl.progress import progress
 from giril_rl.training.episodes import EpisodeTracker
 from giril_rl.training.interrupt import Interrupt, Interrupted
@@ -27,13 +27,7 @@ if TYPE_CHECKING:
     from giril_rl.training.reward_learner import RewardLearner
     from giril_rl.training.run import Run
 
-LEARNER_KEYS = (
-    NORMALISED,
-    "action",
-    "action_log_prob",
-    "advantage",
-    "value_target",
-)
+LEARNER_KEYS = ("action", "action_log_prob", "advantage", "value_target")
 NO_FAILURE = "no_failure"
 """Stands for ``"terminated"`` where a failure is taken for a time limit: False everywhere."""
 
@@ -47,7 +41,7 @@ class Trained(NamedTuple):
 
 def train_ppo(
     env: BatchedEnv,
-    agent: ActorCritic,
+    agent: Agent,
     relabel: nn.Module,
     cfg: PPOConfig,
     *,
@@ -185,7 +179,7 @@ class PPOLearner:
     """
 
     def __init__(
-        self, agent: ActorCritic, cfg: PPOConfig, *, total_steps: int, termination: str = "ends"
+        self, agent: Agent, cfg: PPOConfig, *, total_steps: int, termination: str = "ends"
     ) -> None:
         if termination not in ("ends", "bootstrap"):
             raise UserError(f"termination={termination}: choose one of ends, bootstrap.")
@@ -193,18 +187,21 @@ class PPOLearner:
         self.agent = agent
         self.cfg = cfg
         self.total_steps = total_steps
-        critic = agent.critic_for_loss()
         # Standardised over the whole batch, not per minibatch: a minibatch without any event would
         # have its noise blown up to unit variance, and the policy would follow it.
         self.advantage = GAE(
-            gamma=cfg.gamma, lmbda=cfg.lmbda, value_network=critic, average_gae=True
+            gamma=cfg.gamma,
+            lmbda=cfg.lmbda,
+            value_network=agent.value_network(),
+            average_gae=True,
         )
         if self.bootstraps_failure:
             self.advantage.set_keys(terminated=NO_FAILURE)
         loss = RecordableClipPPOLoss(
             agent.actor_for_loss(),
-            critic,
+            agent.critic_for_loss(),
             clip_epsilon=cfg.clip,
+            clip_value=cfg.clip if cfg.clip_value else None,
             entropy_bonus=cfg.entropy_coef > 0,
             entropy_coeff=cfg.entropy_coef,
             critic_coeff=cfg.value_coef,
@@ -213,9 +210,11 @@ class PPOLearner:
             log_explained_variance=False,
             functional=False,
         )
+        # The clipped value loss compares with the value as it was.
+        self.keys = (*agent.input_keys, *LEARNER_KEYS, *["state_value"] * cfg.clip_value)
         self.gradients = TracedGradients(
             loss,
-            keys=LEARNER_KEYS,
+            keys=self.keys,
             log=("kl_approx", "clip_fraction"),
             max_grad_norm=cfg.max_grad_norm,
         )
@@ -243,12 +242,12 @@ class PPOLearner:
             following = batch.get(("next", "following_observation"), None)
             if following is None:
                 following = batch.get(("next", "observation"))
-            batch.set(("next", NORMALISED), self.agent.normaliser(following))
+            self.agent.look_ahead(batch, following)
             if self.bootstraps_failure:
                 failed = batch.get(("next", "terminated"))
                 batch.set(("next", NO_FAILURE), torch.zeros_like(failed))
             self.advantage(batch)
-        flat = [batch.get(key).flatten(0, 1) for key in LEARNER_KEYS]
+        flat = [batch.get(key).flatten(0, 1) for key in self.keys]
         for _ in range(cfg.epochs):
             logs: list[dict[str, torch.Tensor]] = []
             order = torch.randperm(batch.numel())

@@ -8,7 +8,7 @@ from typing import Any
 from giril_rl.configs import RunConfig
 from giril_rl.demos import Demonstration
 from giril_rl.naming import config_hash
-from giril_rl.networks.policy import ActorCritic
+from giril_rl.networks.agents import Agent
 from giril_rl.report.curve import write_curve
 from giril_rl.report.losses import loss_points, write_losses
 from giril_rl.training.agent import save_agent
@@ -22,7 +22,7 @@ from giril_rl.training.run import Run
 def finish_run(
     run: Run,
     cfg: RunConfig,
-    agent: ActorCritic | RandomPolicy,
+    agent: Agent | RandomPolicy,
     trained: Trained,
     *,
     method: str,
@@ -45,7 +45,7 @@ def finish_run(
     Returns:
         What ``result.json`` holds.
     """
-    if isinstance(agent, ActorCritic):
+    if not isinstance(agent, RandomPolicy):
         save_agent(agent, run.folder)
     scores = evaluate_both(agent, cfg.task, episodes=cfg.eval.episodes, seed=cfg.eval.seed)
     result: dict[str, Any] = {

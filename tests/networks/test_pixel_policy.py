@@ -23,7 +23,7 @@ def observe(*batch):
 def agent():
     agent = PixelActorCritic(5)
     with torch.no_grad():
-        agent.actor.weight.mul_(100)  # far from uniform, so that probabilities can be told apart
+        agent.actor.head.weight.mul_(100)  # Far from uniform.
     return agent
 
 
@@ -31,19 +31,19 @@ def agent():
 def passes(agent):
     """Appended to at each pass through the trunk."""
     calls = []
-    agent.trunk.register_forward_hook(lambda *_: calls.append(1))
+    agent.actor.trunk.register_forward_hook(lambda *_: calls.append(1))
     return calls
 
 
 def by_hand(agent, observation):
     """Logits and value ``(N,)`` of frames ``(N, 4, 84, 84)``, layer by layer."""
-    one, two, three, full = (x for x in agent.trunk if isinstance(x, (nn.Conv2d, nn.Linear)))
+    one, two, three, full = (x for x in agent.actor.trunk if isinstance(x, (nn.Conv2d, nn.Linear)))
     x = observation.double() / 255
     for layer, stride in ((one, 4), (two, 2), (three, 1)):
         x = F.conv2d(x, layer.weight.double(), layer.bias.double(), stride=stride).clamp(min=0)
     x = (x.flatten(1) @ full.weight.double().T + full.bias.double()).clamp(min=0)
     logits, value = (
-        x @ head.weight.double().T + head.bias.double() for head in (agent.actor, agent.critic)
+        x @ head.weight.double().T + head.bias.double() for head in (agent.actor.head, agent.critic)
     )
     return logits, value.squeeze(-1)
 
