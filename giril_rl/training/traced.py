@@ -10,6 +10,8 @@ from torch import Tensor, nn
 
 from giril_rl.training.recorded import record
 
+_CONVOLUTIONS = (nn.Conv2d, nn.ConvTranspose2d)
+
 
 class TracedGradients:
     """Computes a loss module's losses and their gradients by a graph recorded once.
@@ -20,6 +22,9 @@ class TracedGradients:
     a loss is dropped. The numbers are the module's own, bit for bit; a step takes less than half
     the time, and nothing is compiled (``torch.compile`` was both slower to start and slower to run
     for these sizes on a CPU: see ``tests/benchmarks``).
+
+    A module with convolutions is called as it is: they take nearly all of its time, their backward
+    pass cannot be recorded, and batch normalisation changes its statistics at each call.
 
     Tensors that are not parameters (coefficients, scales) are recorded as they are at the first
     call, so that they must not be replaced later. A new batch shape is recorded anew.
@@ -65,6 +70,7 @@ class TracedGradients:
         self._names = [name for name, _ in named]
         self.parameters = [p for _, p in named]
         self._data = [p.detach() for p in self.parameters]
+        self._recorded = not any(isinstance(part, _CONVOLUTIONS) for part in loss.modules())
         self._graphs: dict[tuple[torch.Size, ...], tuple[Callable, list[str]]] = {}
 
     def __call__(self, batch: TensorDictBase) -> dict[str, Tensor]:
@@ -117,8 +123,9 @@ class TracedGradients:
             names[:] = [*losses, *logged]
             return (*gradients, *(v.detach() for v in losses.values()), *logged.values())
 
-        function = record(losses_and_gradients, [*self._data, *inputs])
-        return function, list(names)
+        if not self._recorded:
+            return losses_and_gradients, names
+        return record(losses_and_gradients, [*self._data, *inputs]), list(names)
 
 
 class _Holder(nn.Module):
