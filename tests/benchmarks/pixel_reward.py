@@ -1,0 +1,78 @@
+"""Transitions per second of GIRIL's pixel reward: the whole decoder and the factored form in turns.
+
+python tests/benchmarks/pixel_reward.py [--threads 1] [--batch 1024] [--actions 4] [--rounds 3]
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import time
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from giril_rl.networks.pixel_decoder import PixelDecoder
+from giril_rl.rewards.factored import factored_error
+
+
+def literal_error(
+    decoder: PixelDecoder, action: Tensor, observation: Tensor, following: Tensor, chunk: int
+) -> Tensor:
+    """Eq. 2 at beta = 1 with the decoder run for every transition."""
+    codes = torch.eye(decoder.actions)
+    errors = []
+    for some in torch.arange(len(action)).split(chunk):
+        s, after = (x[some[0] : some[-1] + 1].float() / 127.5 - 1 for x in (observation, following))
+        predicted = decoder(codes[action[some]], s).clamp_(-1, 1)
+        errors.append(predicted.sub_(after).square_().sum((1, 2, 3)))
+    return torch.cat(errors)
+
+
+def seconds(function: Callable[[], Tensor]) -> float:
+    """How long one call takes."""
+    began = time.perf_counter()
+    function()
+    return time.perf_counter() - began
+
+
+@torch.no_grad()
+def main() -> None:
+    """Time both and print the medians."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--batch", type=int, default=1024)
+    parser.add_argument("--actions", type=int, default=4)
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--chunk", type=int, default=16, help="of the factored form")
+    parser.add_argument("--literal-chunk", type=int, default=0, help="0: all at once")
+    args = parser.parse_args()
+    torch.set_num_threads(args.threads)
+    torch.manual_seed(0)
+    decoder = PixelDecoder(args.actions)
+    shape = (args.batch, 4, 84, 84)
+    observation, following = (torch.randint(256, shape, dtype=torch.uint8) for _ in range(2))
+    data = (torch.randint(args.actions, (args.batch,)), observation, following)
+
+    def literal() -> Tensor:
+        return literal_error(decoder, *data, args.literal_chunk or args.batch)
+
+    def factored() -> Tensor:
+        return factored_error(table, decoder.state_weight, *data, chunk=args.chunk)
+
+    # A reward needs the table once per update of its model, so it is timed by itself.
+    table = decoder.action_table()
+    slow, fast = literal(), factored()
+    difference = ((fast - slow) / slow).abs().max().item()
+    times = [(seconds(literal), seconds(factored)) for _ in range(args.rounds)]
+    tables = [seconds(decoder.action_table) for _ in range(args.rounds)]
+    for name, taken in zip(("literal", "factored"), zip(*times, strict=True), strict=True):
+        print(f"{name:<10}{args.batch / statistics.median(taken):12,.0f} transitions/s")
+    print(f"the table takes {statistics.median(tables) * 1e3:.1f} ms, once")
+    ratio = statistics.median(a / b for a, b in times)
+    print(f"factored is {ratio:.1f} times as fast; largest relative difference {difference:.1e}")
+
+
+if __name__ == "__main__":
+    main()
