@@ -99,7 +99,21 @@ def _check_cloning(config: Any, cloning: BCConfig) -> None:
         )
 
 
+def _check_normalise(config: Any) -> None:
+    """Frames have one rule of normalisation, and it is for nothing else."""
+    for part in fields(config):
+        rule = getattr(getattr(config, part.name), "normalise", None)
+        if rule is not None and (rule == "pixels") != config.task.is_atari:
+            right = "pixels" if config.task.is_atari else "standardise"
+            raise UserError(
+                f"{part.name}.normalise={rule} does not fit the observations of "
+                f"{config.task.name}: set {part.name}.normalise={right}."
+            )
+
+
 def _check_run(config: Any) -> None:
+    if isinstance(config, RunConfig):
+        _check_normalise(config)
     if isinstance(config, ExpertRunConfig):
         _check_expert_run(config)
     cloning = getattr(config, "bc", None)

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import cast
 
 from torchrl.envs import Compose
 
@@ -20,15 +19,11 @@ from giril_rl.configs import (
 )
 from giril_rl.demos import subsample
 from giril_rl.envs import make_env
-from giril_rl.rewards import (
-    BottleneckLoss,
-    BottleneckReward,
-    DiscriminatorScaling,
-    RewardForm,
-)
+from giril_rl.rewards import BottleneckLoss
 from giril_rl.training import (
     AdversarialLearner,
     Run,
+    bottleneck_reward,
     check_inputs,
     finish_run,
     make_agent,
@@ -59,17 +54,7 @@ def main(cfg: Config, out: Path) -> None:
         env = make_env(cfg.task, cfg.ppo.num_envs, cfg.seed)
 
         reward_seed = cfg.seed if cfg.reward.seed is None else cfg.reward.seed
-        reward = BottleneckReward.for_vectors(
-            env.observation_spec["observation"].shape[-1],
-            env.action_spec,
-            hidden=cfg.reward.hidden,
-            latent=cfg.reward.latent,
-            form=cast(RewardForm, cfg.reward.form),
-            normalise=cast(DiscriminatorScaling, cfg.reward.normalise),
-            clamp=cfg.reward.clamp,
-            seed=reward_seed,
-        )
-        reward.fit_scaler(demo.transitions["observation"])
+        reward = bottleneck_reward(cfg.reward, env, demo, seed=reward_seed)
         learner = AdversarialLearner(
             BottleneckLoss(
                 reward,

@@ -53,7 +53,7 @@ def test_defaults_pass():
         (
             "reward.normalise",
             "x",
-            "reward.normalise=x: choose one of demo_range, standardise, raw.",
+            "reward.normalise=x: choose one of demo_range, standardise, raw, pixels.",
         ),
         ("scaling.reset", "x", "scaling.reset=x: choose one of never, done."),
         ("logger", "x", "logger=x: choose one of tensorboard, csv, wandb, mlflow, null."),

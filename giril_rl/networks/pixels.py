@@ -112,6 +112,28 @@ class PixelEncoder(nn.Module):
         return out.reshape(*observation.shape[:-3], *out.shape[1:])
 
 
+class PixelPrior(nn.Module):
+    """GIRIL's conditional prior for pixels: mean and log-variance of ``p(z | s)`` (paper, eq. 1).
+
+    Args:
+        actions: |A|, the size of z.
+        channels: frames in an observation.
+
+    Examples:
+        >>> PixelPrior(6)(torch.zeros(2, 4, 84, 84)).shape
+        torch.Size([2, 12])
+    """
+
+    def __init__(self, actions: int, channels: int = 4) -> None:
+        super().__init__()
+        self.features = PixelFeatures(channels)
+        self.head = xavier(nn.Linear(FEATURES, 2 * actions))
+
+    def forward(self, observation: Tensor) -> Tensor:
+        """``(*batch, 2 * actions)`` for observations scaled to [-1, 1]."""
+        return self.head(self.features(observation))
+
+
 class PixelFeatures(nn.Module):
     """ICM's features phi for pixels: :func:`conv_stack` of one observation (paper, Table 2).
 

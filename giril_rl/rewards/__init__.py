@@ -16,6 +16,7 @@ from giril_rl.rewards.curiosity import CuriosityReward, feature_error
 from giril_rl.rewards.curiosity_loss import CuriosityRewardLoss, FeatureTraining
 from giril_rl.rewards.discriminator import DiscriminatorReward, DiscriminatorScaling
 from giril_rl.rewards.discriminator_loss import DiscriminatorLoss
+from giril_rl.rewards.factored import factored_error
 from giril_rl.rewards.generative import (
     GenerativeReward,
     Prior,
@@ -28,6 +29,7 @@ from giril_rl.rewards.generative_loss import (
     gaussian_kl,
 )
 from giril_rl.rewards.noise import NoiseReward
+from giril_rl.rewards.pixel_scaler import PixelScaler
 from giril_rl.rewards.scaler import ObservationScaler, ScalingRule
 from giril_rl.rewards.transition_loss import TransitionLoss
 
@@ -48,6 +50,7 @@ __all__ = [
     "GenerativeRewardLoss",
     "NoiseReward",
     "ObservationScaler",
+    "PixelScaler",
     "Prior",
     "RewardForm",
     "ScalingRule",
@@ -56,6 +59,7 @@ __all__ = [
     "adversarial_reward",
     "blend_action",
     "discriminator_loss",
+    "factored_error",
     "feature_error",
     "gaussian_kl",
     "gradient_penalty",

@@ -10,6 +10,8 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.data import TensorSpec
 
+from giril_rl.networks.joined import JoinedSequential
+from giril_rl.networks.pixel_discriminators import PixelBottleneck
 from giril_rl.networks.vectors import mlp
 from giril_rl.rewards.actions import ActionEncoder
 from giril_rl.rewards.adversarial import RewardForm
@@ -19,6 +21,7 @@ from giril_rl.rewards.discriminator import (
     discriminator_scaler,
 )
 from giril_rl.rewards.keys import PAIR_KEYS, REWARD_KEYS
+from giril_rl.rewards.pixel_scaler import PixelScaler
 
 
 class BottleneckReward(DiscriminatorReward):
@@ -28,7 +31,8 @@ class BottleneckReward(DiscriminatorReward):
     et al. 2019, arXiv 1810.00821). Train it with :class:`~giril_rl.rewards.BottleneckLoss`.
 
     Args:
-        encoder: maps ``cat(s, action code)`` to ``2 * latent`` numbers, mean and log-variance of z.
+        encoder: called with s and the action's code, gives ``2 * latent`` numbers, mean and
+            log-variance of z.
         head: maps z to one number, the logit of "this is the expert's".
         **kwargs: those of :class:`~giril_rl.rewards.DiscriminatorReward`.
 
@@ -80,7 +84,7 @@ class BottleneckReward(DiscriminatorReward):
         actions = ActionEncoder(action_spec)
         with torch.random.fork_rng(devices=[]):
             torch.default_generator.manual_seed(seed)
-            encoder = mlp(observation_dim + actions.size, 2 * latent, hidden)
+            encoder = JoinedSequential(*mlp(observation_dim + actions.size, 2 * latent, hidden))
             head = nn.Linear(latent, 1)
         return cls(
             encoder,
@@ -92,9 +96,50 @@ class BottleneckReward(DiscriminatorReward):
             out_keys=out_keys,
         )
 
+    @classmethod
+    def for_pixels(
+        cls,
+        action_spec: TensorSpec,
+        *,
+        channels: int = 4,
+        form: RewardForm = "positive",
+        seed: int = 0,
+        in_keys: Sequence[NestedKey] = PAIR_KEYS,
+        out_keys: Sequence[NestedKey] = REWARD_KEYS,
+        latent: int = 8,
+    ) -> BottleneckReward:
+        """The paper's body for stacks of 84x84 frames and a linear head on z.
+
+        Args:
+            action_spec: see :meth:`DiscriminatorReward.for_pixels`, as for all others.
+            channels: frames in an observation.
+            form: the reward's form.
+            seed: seed of the weights.
+            in_keys: keys of observation and action.
+            out_keys: where the reward is written, one key.
+            latent: size of z.
+
+        Raises:
+            UserError: for an unknown form or kind of action.
+        """
+        actions = ActionEncoder(action_spec)
+        with torch.random.fork_rng(devices=[]):
+            torch.default_generator.manual_seed(seed)
+            encoder = PixelBottleneck(actions.size, latent, channels)
+            head = nn.Linear(latent, 1)
+        return cls(
+            encoder,
+            head,
+            scaler=PixelScaler(),
+            actions=actions,
+            form=form,
+            in_keys=in_keys,
+            out_keys=out_keys,
+        )
+
     def encode(self, observation: Tensor, action_code: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and log-variance of z for a scaled observation and an action's code."""
-        mu, logvar = self.network(torch.cat((observation, action_code), -1)).chunk(2, -1)
+        mu, logvar = self.network(observation, action_code).chunk(2, -1)
         return mu, logvar
 
     def judge(self, z: Tensor) -> Tensor:

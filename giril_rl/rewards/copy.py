@@ -7,9 +7,12 @@ from collections.abc import Sequence
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, dispatch
 from tensordict.utils import NestedKey
+from torch import Tensor
 
+from giril_rl.rewards.chunks import PIXELS_AT_ONCE, in_chunks
 from giril_rl.rewards.generative import reconstruction_error
 from giril_rl.rewards.keys import REWARD_KEYS, check_keys
+from giril_rl.rewards.pixel_scaler import PixelScaler
 from giril_rl.rewards.scaler import ObservationScaler
 
 
@@ -19,8 +22,8 @@ class CopyReward(TensorDictModuleBase):
     It pays for how far the scaled (and clamped) state moves in a step. A generative model that has
     learned little more than that states change slowly pays much the same.
 
-    Reads observation ``(*batch, d)`` and next observation, writes one reward per transition,
-    ``(*batch, 1)``. Only the scaler has to be fitted.
+    Reads observation ``(*batch, d)``, or frames, and next observation, writes one reward per
+    transition, ``(*batch, 1)``. Only the scaler has to be fitted.
 
     Args:
         scaler: applied to both observations.
@@ -43,7 +46,7 @@ class CopyReward(TensorDictModuleBase):
 
     def __init__(
         self,
-        scaler: ObservationScaler,
+        scaler: ObservationScaler | PixelScaler,
         *,
         scale: float = 1.0,
         in_keys: Sequence[NestedKey] = ("observation", ("next", "observation")),
@@ -59,6 +62,12 @@ class CopyReward(TensorDictModuleBase):
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes each transition's reward."""
-        observation, following = (self.scaler(tensordict.get(key)) for key in self.in_keys)
-        reward = self.scale * reconstruction_error(observation, following)
-        return tensordict.set(self.out_keys[0], reward.unsqueeze(-1))
+        pair = tuple(tensordict.get(key) for key in self.in_keys)
+        batch = pair[0].shape[: pair[0].ndim - self.scaler.event_dims]
+        size = PIXELS_AT_ONCE if self.scaler.event_dims == 3 else None
+        error = in_chunks(self._error, pair, batch, size)
+        return tensordict.set(self.out_keys[0], self.scale * error.unsqueeze(-1))
+
+    def _error(self, observation: Tensor, following: Tensor) -> Tensor:
+        pair = self.scaler(observation), self.scaler(following)
+        return reconstruction_error(*pair, self.scaler.event_dims)

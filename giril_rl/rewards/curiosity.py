@@ -11,9 +11,13 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.data import TensorSpec
 
+from giril_rl.networks.joined import JoinedSequential
+from giril_rl.networks.pixels import ForwardModel, InverseModel, PixelFeatures
 from giril_rl.networks.vectors import mlp
 from giril_rl.rewards.actions import ActionEncoder
+from giril_rl.rewards.chunks import PIXELS_AT_ONCE, in_chunks
 from giril_rl.rewards.keys import REWARD_KEYS, TRANSITION_KEYS, check_keys
+from giril_rl.rewards.pixel_scaler import PixelScaler
 from giril_rl.rewards.scaler import ObservationScaler, ScalingRule
 
 
@@ -46,8 +50,8 @@ class CuriosityReward(TensorDictModuleBase):
 
     Args:
         features: phi, maps a scaled observation to its features.
-        inverse_model: maps ``cat(phi(s), phi(s'))`` to logits of the action or to its code.
-        forward_model: maps ``cat(phi(s), action code)`` to the predicted ``phi(s')``.
+        inverse_model: called with ``phi(s)`` and ``phi(s')``, gives the action's logits or code.
+        forward_model: called with ``phi(s)`` and the action's code, predicts ``phi(s')``.
         scaler: applied to both observations.
         actions: turns actions into codes.
         scale: lambda.
@@ -73,7 +77,7 @@ class CuriosityReward(TensorDictModuleBase):
         inverse_model: nn.Module,
         forward_model: nn.Module,
         *,
-        scaler: ObservationScaler,
+        scaler: ObservationScaler | PixelScaler,
         actions: ActionEncoder,
         scale: float = 1.0,
         in_keys: Sequence[NestedKey] = TRANSITION_KEYS,
@@ -132,8 +136,8 @@ class CuriosityReward(TensorDictModuleBase):
             features: nn.Module = nn.Identity()
             if hidden:
                 features = nn.Sequential(*mlp(observation_dim, size, hidden[:-1]), nn.Tanh())
-            inverse_model = mlp(2 * size, actions.size, model_hidden)
-            forward_model = mlp(size + actions.size, size, model_hidden)
+            inverse_model = JoinedSequential(*mlp(2 * size, actions.size, model_hidden))
+            forward_model = JoinedSequential(*mlp(size + actions.size, size, model_hidden))
         return cls(
             features,
             inverse_model,
@@ -145,20 +149,67 @@ class CuriosityReward(TensorDictModuleBase):
             out_keys=out_keys,
         )
 
+    @classmethod
+    def for_pixels(
+        cls,
+        action_spec: TensorSpec,
+        *,
+        channels: int = 4,
+        scale: float = 1.0,
+        seed: int = 0,
+        in_keys: Sequence[NestedKey] = TRANSITION_KEYS,
+        out_keys: Sequence[NestedKey] = REWARD_KEYS,
+    ) -> CuriosityReward:
+        """The paper's bodies for stacks of 84x84 frames (Table 2), initialised from ``seed`` alone.
+
+        Batch normalisation makes the reward depend on its batch while the module is in training
+        mode; :class:`~giril_rl.transforms.IntrinsicReward` calls it in eval mode.
+
+        Args:
+            action_spec: the environment's action spec, discrete.
+            channels: frames in an observation.
+            scale: see :meth:`for_vectors`, as for all others.
+            seed: seed of the weights.
+            in_keys: keys of observation, action and next observation.
+            out_keys: where the reward is written, one key.
+
+        Raises:
+            UserError: for an unknown kind of action.
+        """
+        actions = ActionEncoder(action_spec)
+        with torch.random.fork_rng(devices=[]):
+            torch.default_generator.manual_seed(seed)
+            features = PixelFeatures(channels)
+            inverse_model, forward_model = InverseModel(actions.size), ForwardModel(actions.size)
+        return cls(
+            features,
+            inverse_model,
+            forward_model,
+            scaler=PixelScaler(),
+            actions=actions,
+            scale=scale,
+            in_keys=in_keys,
+            out_keys=out_keys,
+        )
+
     def invert(self, features: Tensor, next_features: Tensor) -> Tensor:
         """``a_hat``: logits of a discrete action, the code of a continuous one."""
-        return self.inverse_model(torch.cat((features, next_features), -1))
+        return self.inverse_model(features, next_features)
 
     def predict(self, features: Tensor, action_code: Tensor) -> Tensor:
         """``phi_hat(s')`` from ``phi(s)`` and the action's code."""
-        return self.forward_model(torch.cat((features, action_code), -1))
+        return self.forward_model(features, action_code)
 
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes each transition's reward."""
         observation, action, following = (tensordict.get(key) for key in self.in_keys)
+        batch = observation.shape[: observation.ndim - self.scaler.event_dims]
+        size = PIXELS_AT_ONCE if self.scaler.event_dims == 3 else None
+        error = in_chunks(self._error, (observation, action, following), batch, size)
+        return tensordict.set(self.out_keys[0], self.scale * error.unsqueeze(-1))
+
+    def _error(self, observation: Tensor, action: Tensor, following: Tensor) -> Tensor:
         features = self.features(self.scaler(observation))
         next_features = self.features(self.scaler(following))
-        predicted = self.predict(features, self.actions(action))
-        reward = self.scale * feature_error(predicted, next_features)
-        return tensordict.set(self.out_keys[0], reward.unsqueeze(-1))
+        return feature_error(self.predict(features, self.actions(action)), next_features)

@@ -13,11 +13,15 @@ from torch import Tensor, nn
 from torchrl.data import TensorSpec
 
 from giril_rl.errors import UserError
+from giril_rl.networks.joined import JoinedSequential
 from giril_rl.networks.normalise import RunningNormaliser
+from giril_rl.networks.pixel_discriminators import PixelDiscriminator
 from giril_rl.networks.vectors import mlp
 from giril_rl.rewards.actions import ActionEncoder
 from giril_rl.rewards.adversarial import RewardForm, adversarial_reward
+from giril_rl.rewards.chunks import PIXELS_AT_ONCE, in_chunks
 from giril_rl.rewards.keys import PAIR_KEYS, REWARD_KEYS, check_keys
+from giril_rl.rewards.pixel_scaler import PixelScaler
 from giril_rl.rewards.scaler import ObservationScaler
 
 DiscriminatorScaling = Literal["running", "demo_range", "standardise", "raw"]
@@ -26,12 +30,13 @@ DiscriminatorScaling = Literal["running", "demo_range", "standardise", "raw"]
 class DiscriminatorReward(TensorDictModuleBase):
     """A reward made of a discriminator's logit, see :func:`~giril_rl.rewards.adversarial_reward`.
 
-    Reads observation ``(*batch, d)`` and action, and writes one reward per transition,
+    Reads observation ``(*batch, d)``, or frames, and action, and writes one reward per transition,
     ``(*batch, 1)``; the next observation takes no part (Ho and Ermon 2016, and the paper). Train it
     with :class:`~giril_rl.rewards.DiscriminatorLoss`.
 
     Args:
-        network: maps ``cat(s, action code)`` to one number, the logit of "this is the expert's".
+        network: called with s and the action's code, gives one number, the logit of "this is the
+            expert's".
         scaler: applied to the observation.
         actions: turns actions into codes.
         form: the reward's form.
@@ -103,7 +108,7 @@ class DiscriminatorReward(TensorDictModuleBase):
         actions = ActionEncoder(action_spec)
         with torch.random.fork_rng(devices=[]):
             torch.default_generator.manual_seed(seed)
-            network = mlp(observation_dim + actions.size, 1, hidden)
+            network = JoinedSequential(*mlp(observation_dim + actions.size, 1, hidden))
         return cls(
             network,
             scaler=discriminator_scaler(observation_dim, normalise, clamp),
@@ -113,9 +118,46 @@ class DiscriminatorReward(TensorDictModuleBase):
             out_keys=out_keys,
         )
 
+    @classmethod
+    def for_pixels(
+        cls,
+        action_spec: TensorSpec,
+        *,
+        channels: int = 4,
+        form: RewardForm = "positive",
+        seed: int = 0,
+        in_keys: Sequence[NestedKey] = PAIR_KEYS,
+        out_keys: Sequence[NestedKey] = REWARD_KEYS,
+    ) -> DiscriminatorReward:
+        """The paper's body for stacks of 84x84 frames, initialised from ``seed`` alone.
+
+        Args:
+            action_spec: the environment's action spec, discrete.
+            channels: frames in an observation.
+            form: see :meth:`for_vectors`, as for all others.
+            seed: seed of the weights.
+            in_keys: keys of observation and action.
+            out_keys: where the reward is written, one key.
+
+        Raises:
+            UserError: for an unknown form or kind of action.
+        """
+        actions = ActionEncoder(action_spec)
+        with torch.random.fork_rng(devices=[]):
+            torch.default_generator.manual_seed(seed)
+            network = PixelDiscriminator(actions.size, channels=channels)
+        return cls(
+            network,
+            scaler=PixelScaler(),
+            actions=actions,
+            form=form,
+            in_keys=in_keys,
+            out_keys=out_keys,
+        )
+
     def fit_scaler(self, observations: Tensor) -> None:
         """Fits the scaler to the demonstration's ``(N, d)``, unless it follows the policy's."""
-        if isinstance(self.scaler, ObservationScaler):
+        if isinstance(self.scaler, (ObservationScaler, PixelScaler)):
             self.scaler.fit(observations)
 
     def observe(self, observations: Tensor) -> None:
@@ -129,14 +171,19 @@ class DiscriminatorReward(TensorDictModuleBase):
 
     def logit(self, observation: Tensor, action_code: Tensor) -> Tensor:
         """The logit ``(*batch,)`` of a scaled observation and an action's code."""
-        return self.network(torch.cat((observation, action_code), -1)).squeeze(-1)
+        return self.network(observation, action_code).squeeze(-1)
 
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes each transition's reward."""
-        observation, action = (tensordict.get(key) for key in self.in_keys)
-        reward = adversarial_reward(self.logit(*self.inputs(observation, action)), self.form)
+        pair = tuple(tensordict.get(key) for key in self.in_keys)
+        dims = 3 if isinstance(self.scaler, PixelScaler) else 1
+        size = PIXELS_AT_ONCE if dims == 3 else None
+        reward = in_chunks(self._value, pair, pair[0].shape[: pair[0].ndim - dims], size)
         return tensordict.set(self.out_keys[0], reward.unsqueeze(-1))
+
+    def _value(self, observation: Tensor, action: Tensor) -> Tensor:
+        return adversarial_reward(self.logit(*self.inputs(observation, action)), self.form)
 
 
 def discriminator_scaler(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal, get_args
+from typing import Literal, cast, get_args
 
 import torch
 from tensordict import TensorDictBase
@@ -13,24 +13,35 @@ from torch import Tensor, nn
 from torchrl.data import TensorSpec
 
 from giril_rl.errors import UserError
+from giril_rl.networks.joined import JoinedSequential
+from giril_rl.networks.pixel_decoder import PixelDecoder
+from giril_rl.networks.pixels import PixelEncoder, PixelPrior
 from giril_rl.networks.vectors import mlp
 from giril_rl.rewards.actions import ActionEncoder
+from giril_rl.rewards.chunks import PIXELS_AT_ONCE, in_chunks
+from giril_rl.rewards.factored import factored_error
 from giril_rl.rewards.keys import REWARD_KEYS, TRANSITION_KEYS, check_keys
+from giril_rl.rewards.pixel_scaler import PixelScaler
 from giril_rl.rewards.scaler import ObservationScaler, ScalingRule
 
 Prior = Literal["standard", "conditional"]
 
 
-def reconstruction_error(predicted: Tensor, target: Tensor) -> Tensor:
-    """The squared L2 norm of ``predicted - target`` over the last dimension (paper, eq. 2).
+def reconstruction_error(predicted: Tensor, target: Tensor, dims: int = 1) -> Tensor:
+    """The squared L2 norm of ``predicted - target`` of each observation (paper, eq. 2).
 
     Times lambda it is also ``-log p(s' | z, s)`` up to a constant (eq. 1's first term).
+
+    Args:
+        predicted: ``(*batch, *observation)``.
+        target: of the same shape.
+        dims: dimensions of one observation, the last ones: 1 for a vector, 3 for frames.
 
     Examples:
         >>> reconstruction_error(torch.tensor([[1.0, 2.0]]), torch.tensor([[0.0, 4.0]]))
         tensor([5.])
     """
-    return (predicted - target).square().sum(-1)
+    return (predicted - target).square().flatten(-dims).sum(-1)
 
 
 def blend_action(action_code: Tensor, encoded: Tensor, beta: float) -> Tensor:
@@ -52,13 +63,15 @@ class GenerativeReward(TensorDictModuleBase):
     With ``beta<1`` the noise comes from a generator of the module's own, whose state is saved with
     the module; a batch and the same transitions step by step then agree in distribution only.
 
-    Reads observation ``(*batch, d)``, action and next observation, writes one reward per
-    transition, ``(*batch, 1)``, without averaging. Train it with
+    Reads observation ``(*batch, d)`` or, of uint8, ``(*batch, channels, 84, 84)``, action and next
+    observation, writes one reward per transition, ``(*batch, 1)``, without averaging. For frames at
+    ``beta=1`` the decoder runs once for each action rather than once for each transition, see
+    :func:`~giril_rl.rewards.factored_error`; the numbers are the same to 1e-5. Train it with
     :class:`~giril_rl.rewards.GenerativeRewardLoss`, after ``reward.scaler.fit(observations)``.
 
     Args:
-        encoder: maps ``cat(s, s')`` to ``2 * latent`` numbers, mean and log-variance of z.
-        decoder: maps ``cat(action code, s)`` to the predicted next observation.
+        encoder: called with s and s', gives ``2 * latent`` numbers, mean and log-variance of z.
+        decoder: called with the action's code and s, gives the predicted next observation.
         scaler: applied to both observations.
         actions: turns actions into codes of the latent's size.
         prior_network: maps s to mean and log-variance of ``p(z | s)``; None means N(0, I).
@@ -86,7 +99,7 @@ class GenerativeReward(TensorDictModuleBase):
         encoder: nn.Module,
         decoder: nn.Module,
         *,
-        scaler: ObservationScaler,
+        scaler: ObservationScaler | PixelScaler,
         actions: ActionEncoder,
         prior_network: nn.Module | None = None,
         beta: float = 1.0,
@@ -111,6 +124,7 @@ class GenerativeReward(TensorDictModuleBase):
         self.beta = beta
         self.scale = scale
         self._generator = torch.Generator().manual_seed(seed)
+        self._table: tuple[object, Tensor] | None = None
 
     @classmethod
     def for_vectors(
@@ -153,7 +167,8 @@ class GenerativeReward(TensorDictModuleBase):
         d, k = observation_dim, actions.size
         with torch.random.fork_rng(devices=[]):
             torch.default_generator.manual_seed(seed)
-            encoder, decoder = mlp(2 * d, 2 * k, hidden), mlp(k + d, d, hidden)
+            encoder = JoinedSequential(*mlp(2 * d, 2 * k, hidden))
+            decoder = JoinedSequential(*mlp(k + d, d, hidden))
             prior_network = mlp(d, 2 * k, hidden) if prior == "conditional" else None
         return cls(
             encoder,
@@ -168,14 +183,65 @@ class GenerativeReward(TensorDictModuleBase):
             out_keys=out_keys,
         )
 
+    @classmethod
+    def for_pixels(
+        cls,
+        action_spec: TensorSpec,
+        *,
+        channels: int = 4,
+        beta: float = 1.0,
+        scale: float = 1.0,
+        prior: Prior = "standard",
+        clamp: bool = True,
+        seed: int = 0,
+        in_keys: Sequence[NestedKey] = TRANSITION_KEYS,
+        out_keys: Sequence[NestedKey] = REWARD_KEYS,
+    ) -> GenerativeReward:
+        """The paper's bodies for stacks of 84x84 frames (Table 2), initialised from ``seed`` alone.
+
+        Args:
+            action_spec: the environment's action spec, discrete; z has its size.
+            channels: frames in an observation.
+            beta: see :meth:`for_vectors`, as for all others.
+            scale: lambda.
+            prior: ``"standard"`` or ``"conditional"``.
+            clamp: compare predictions clamped to [-1, 1].
+            seed: seed of weights and noise.
+            in_keys: keys of observation, action and next observation.
+            out_keys: where the reward is written, one key.
+
+        Raises:
+            UserError: for a beta outside (0, 1], or an unknown prior or kind of action.
+        """
+        if prior not in get_args(Prior):
+            raise UserError(f"prior={prior!r} is unknown: choose standard or conditional.")
+        actions = ActionEncoder(action_spec)
+        with torch.random.fork_rng(devices=[]):
+            torch.default_generator.manual_seed(seed)
+            encoder = PixelEncoder(actions.size, channels)
+            decoder = PixelDecoder(actions.size, channels)
+            prior_network = PixelPrior(actions.size, channels) if prior == "conditional" else None
+        return cls(
+            encoder,
+            decoder,
+            scaler=PixelScaler(clamp=clamp),
+            actions=actions,
+            prior_network=prior_network,
+            beta=beta,
+            scale=scale,
+            seed=seed,
+            in_keys=in_keys,
+            out_keys=out_keys,
+        )
+
     def encode(self, observation: Tensor, next_observation: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and log-variance of ``q(z | s, s')``, for scaled observations."""
-        mu, logvar = self.encoder(torch.cat((observation, next_observation), -1)).chunk(2, -1)
+        mu, logvar = self.encoder(observation, next_observation).chunk(2, -1)
         return mu, logvar
 
     def decode(self, action_code: Tensor, observation: Tensor) -> Tensor:
         """The predicted next observation, scaled but not clamped, for a scaled observation."""
-        return self.decoder(torch.cat((action_code, observation), -1))
+        return self.decoder(action_code, observation)
 
     def prior(self, observation: Tensor) -> tuple[Tensor | None, Tensor | None]:
         """Mean and log-variance of ``p(z | s)`` for a scaled observation; None, None if N(0, I)."""
@@ -188,6 +254,18 @@ class GenerativeReward(TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes each transition's reward."""
         observation, action, following = (tensordict.get(key) for key in self.in_keys)
+        if self._is_factored(observation):
+            table, weight = self._action_table()
+            index = self.actions.target(action)
+            clamp = self.scaler.clamp
+            error = factored_error(table, weight, index, observation, following, clamp=clamp)
+        else:
+            batch = observation.shape[: observation.ndim - self.scaler.event_dims]
+            size = PIXELS_AT_ONCE if self.scaler.event_dims == 3 else None
+            error = in_chunks(self._error, (observation, action, following), batch, size)
+        return tensordict.set(self.out_keys[0], self.scale * error.unsqueeze(-1))
+
+    def _error(self, observation: Tensor, action: Tensor, following: Tensor) -> Tensor:
         observation, following = self.scaler(observation), self.scaler(following)
         code = self.actions(action)
         if self.beta < 1:
@@ -195,8 +273,25 @@ class GenerativeReward(TensorDictModuleBase):
         predicted = self.decode(code, observation)
         if self.scaler.clamp:
             predicted = predicted.clamp(-1.0, 1.0)
-        reward = self.scale * reconstruction_error(predicted, following)
-        return tensordict.set(self.out_keys[0], reward.unsqueeze(-1))
+        return reconstruction_error(predicted, following, self.scaler.event_dims)
+
+    def _is_factored(self, observation: Tensor) -> bool:
+        """Whether the decoder's two parts can be computed apart: exact, but without gradient."""
+        return (
+            self.beta == 1
+            and isinstance(self.decoder, PixelDecoder)
+            and observation.dtype == torch.uint8
+            and not torch.is_grad_enabled()
+        )
+
+    @torch.no_grad()
+    def _action_table(self) -> tuple[Tensor, Tensor]:
+        """The decoder's ``action_table`` and ``state_weight``, kept until its weights change."""
+        decoder = cast(PixelDecoder, self.decoder)
+        now = [(weight.data_ptr(), weight._version) for weight in decoder.parameters()]
+        if self._table is None or self._table[0] != now:
+            self._table = now, decoder.action_table()
+        return self._table[1], decoder.state_weight
 
     def _encoded_action(self, observation: Tensor, following: Tensor) -> Tensor:
         mu, logvar = self.encode(observation, following)

@@ -123,7 +123,9 @@ class GenerativeRewardLoss(TransitionLoss):
         observation, following = reward.scaler(observation), reward.scaler(following)
         mu, logvar = reward.encode(observation, following)
         z = mu + (0.5 * logvar).exp() * torch.randn_like(mu)
-        error = reconstruction_error(reward.decode(z, observation), following)
+        error = reconstruction_error(
+            reward.decode(z, observation), following, reward.scaler.event_dims
+        )
         kl = gaussian_kl(mu, logvar, *reward.prior(observation))
         return (
             reward.scale * error,

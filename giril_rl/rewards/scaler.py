@@ -38,6 +38,9 @@ class ObservationScaler(nn.Module):
         [0.5, 1.0]
     """
 
+    event_dims = 1
+    """Dimensions of one observation."""
+
     offset: Tensor
     scale: Tensor
     fitted: Tensor

@@ -11,7 +11,12 @@ from giril_rl.training.ppo import PPOLearner, Trained, train_ppo
 from giril_rl.training.random_policy import RandomPolicy
 from giril_rl.training.result import finish_run
 from giril_rl.training.reward_learner import RewardLearner
-from giril_rl.training.reward_models import curiosity_reward, generative_reward
+from giril_rl.training.reward_models import (
+    bottleneck_reward,
+    curiosity_reward,
+    discriminator_reward,
+    generative_reward,
+)
 from giril_rl.training.run import Run
 from giril_rl.training.scaling import return_scaling
 
@@ -23,10 +28,12 @@ __all__ = [
     "Run",
     "Scores",
     "Trained",
+    "bottleneck_reward",
     "check_inputs",
     "clone_behaviour",
     "control_reward",
     "curiosity_reward",
+    "discriminator_reward",
     "evaluate",
     "evaluate_both",
     "finish_run",

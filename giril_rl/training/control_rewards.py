@@ -2,25 +2,20 @@
 
 from __future__ import annotations
 
-from typing import cast
-
 import torch
 from tensordict.nn import TensorDictModuleBase
 
-from giril_rl.configs import ControlRunConfig, GenerativeConfig
+from giril_rl.configs import ControlRunConfig
 from giril_rl.demos import Demonstration, holdout, subsample
 from giril_rl.envs import BatchedEnv
 from giril_rl.rewards import (
     AffineReward,
     ConstantReward,
-    CopyReward,
     GenerativeRewardLoss,
     NoiseReward,
-    ObservationScaler,
-    ScalingRule,
 )
 from giril_rl.training.fit import fit_reward
-from giril_rl.training.reward_models import curiosity_reward, generative_reward
+from giril_rl.training.reward_models import copy_reward, curiosity_reward, generative_reward
 from giril_rl.training.run import Run
 
 
@@ -42,7 +37,7 @@ def control_reward(
         return ConstantReward(), {}
     seeds = {"expert": cfg.expert.seed, "demo": cfg.demo.seed}
     if cfg.reward == "copy":
-        return _copy(cfg.giril, env, demo), seeds
+        return copy_reward(cfg.giril, env, demo), seeds
     part = cfg.icm if cfg.reward == "untrained_icm" else cfg.giril
     seed = cfg.seed if part.seed is None else part.seed
     seeds = {"reward": seed, **seeds}
@@ -86,9 +81,3 @@ def moments(reward: TensorDictModuleBase, demo: Demonstration) -> tuple[float, f
     view = demo.transitions.select(*reward.in_keys)
     values = reward(view).get(reward.out_keys[0]).double()
     return values.mean().item(), values.var(correction=0).item()
-
-
-def _copy(cfg: GenerativeConfig, env: BatchedEnv, demo: Demonstration) -> CopyReward:
-    size = env.observation_spec["observation"].shape[-1]
-    scaler = ObservationScaler(size, rule=cast(ScalingRule, cfg.normalise), clamp=cfg.clamp)
-    return CopyReward(scaler.fit(demo.transitions["observation"]), scale=cfg.scale)

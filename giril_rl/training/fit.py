@@ -12,6 +12,7 @@ from torchrl.objectives import LossModule
 
 from giril_rl.configs import FitConfig
 from giril_rl.progress import progress
+from giril_rl.rewards.chunks import PIXELS_AT_ONCE
 from giril_rl.training.interrupt import Interrupt, Interrupted
 from giril_rl.training.traced import TracedGradients
 
@@ -68,6 +69,7 @@ def fit_reward(
         while step < cfg.steps:
             block = min(cfg.log_every - step % cfg.log_every, cfg.steps - step)
             indices = torch.randint(len(data), (block, cfg.batch), generator=generator)
+            loss.train()
             for index in indices:
                 gradients.step([column[index] for column in columns])
                 optimizer.step()
@@ -86,17 +88,23 @@ def fit_reward(
                 run.save(phase, state)
             if interrupt.requested and step < cfg.steps:
                 raise Interrupted.at(step, cfg.steps, "fitting steps")
+    loss.eval()
     return time.perf_counter() - began if saved is None or step > saved["step"] else seconds
 
 
 def _evaluate(loss: nn.Module, sets: dict[str, TensorDictBase | None]) -> dict[str, float]:
-    """The loss's terms on whole sets, with noise that leaves the run's random numbers alone."""
+    """The loss's terms on whole sets, with noise that leaves the run's random numbers alone.
+
+    Of frames only the first, for they would take seconds and gigabytes.
+    """
     values: dict[str, float] = {}
+    loss.eval()
     for name, data in sets.items():
         if data is None or not len(data):
             continue
         with torch.no_grad(), torch.random.fork_rng(devices=[]):
             torch.default_generator.manual_seed(0)
-            for key, value in loss(data).items():
+            frames = data.get("observation").ndim > 2
+            for key, value in loss(data[:PIXELS_AT_ONCE] if frames else data).items():
                 values[f"fit/{name}/{str(key).removeprefix('loss_')}"] = value.item()
     return values

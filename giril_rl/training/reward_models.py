@@ -4,10 +4,29 @@ from __future__ import annotations
 
 from typing import cast
 
-from giril_rl.configs import CuriosityConfig, GenerativeConfig
+import torch
+
+from giril_rl.configs import (
+    AdversarialConfig,
+    BottleneckConfig,
+    CuriosityConfig,
+    GenerativeConfig,
+)
 from giril_rl.demos import Demonstration
 from giril_rl.envs import BatchedEnv
-from giril_rl.rewards import CuriosityReward, GenerativeReward, Prior, ScalingRule
+from giril_rl.rewards import (
+    BottleneckReward,
+    CopyReward,
+    CuriosityReward,
+    DiscriminatorReward,
+    DiscriminatorScaling,
+    GenerativeReward,
+    ObservationScaler,
+    PixelScaler,
+    Prior,
+    RewardForm,
+    ScalingRule,
+)
 
 
 def generative_reward(
@@ -31,17 +50,30 @@ def generative_reward(
         >>> generative_reward(GenerativeConfig(), env, demo, seed=0).scaler
         ObservationScaler(4, rule='standardise', clamp=True)
     """
-    reward = GenerativeReward.for_vectors(
-        env.observation_spec["observation"].shape[-1],
-        env.action_spec,
-        hidden=cfg.hidden,
-        beta=cfg.beta,
-        scale=cfg.scale,
-        prior=cast(Prior, cfg.prior),
-        normalise=cast(ScalingRule, cfg.normalise),
-        clamp=cfg.clamp,
-        seed=seed,
-    )
+    prior = cast(Prior, cfg.prior)
+    frames, size = _observation(env)
+    if frames:
+        reward = GenerativeReward.for_pixels(
+            env.action_spec,
+            channels=frames,
+            beta=cfg.beta,
+            scale=cfg.scale,
+            prior=prior,
+            clamp=cfg.clamp,
+            seed=seed,
+        )
+    else:
+        reward = GenerativeReward.for_vectors(
+            size,
+            env.action_spec,
+            hidden=cfg.hidden,
+            beta=cfg.beta,
+            scale=cfg.scale,
+            prior=prior,
+            normalise=cast(ScalingRule, cfg.normalise),
+            clamp=cfg.clamp,
+            seed=seed,
+        )
     reward.scaler.fit(demo.transitions["observation"])
     return reward
 
@@ -67,15 +99,105 @@ def curiosity_reward(
         >>> curiosity_reward(CuriosityConfig(), env, demo, seed=0).scaler
         ObservationScaler(4, rule='standardise', clamp=True)
     """
-    reward = CuriosityReward.for_vectors(
-        env.observation_spec["observation"].shape[-1],
+    frames, size = _observation(env)
+    if frames:
+        reward = CuriosityReward.for_pixels(
+            env.action_spec, channels=frames, scale=cfg.scale, seed=seed
+        )
+    else:
+        reward = CuriosityReward.for_vectors(
+            size,
+            env.action_spec,
+            hidden=cfg.hidden,
+            model_hidden=cfg.model_hidden,
+            scale=cfg.scale,
+            normalise=cast(ScalingRule, cfg.normalise),
+            clamp=cfg.clamp,
+            seed=seed,
+        )
+    reward.scaler.fit(demo.transitions["observation"])
+    return reward
+
+
+def copy_reward(cfg: GenerativeConfig, env: BatchedEnv, demo: Demonstration) -> CopyReward:
+    """The reward of the copy predictor, on GIRIL's scale.
+
+    Args:
+        cfg: GIRIL's settings.
+        env: the environment, for its specs.
+        demo: the demonstration that the scaler is fitted to.
+    """
+    frames, size = _observation(env)
+    scaler: ObservationScaler | PixelScaler
+    if frames:
+        scaler = PixelScaler(clamp=cfg.clamp)
+    else:
+        scaler = ObservationScaler(size, rule=cast(ScalingRule, cfg.normalise), clamp=cfg.clamp)
+    return CopyReward(scaler.fit(demo.transitions["observation"]), scale=cfg.scale)
+
+
+def discriminator_reward(
+    cfg: AdversarialConfig, env: BatchedEnv, demo: Demonstration, *, seed: int
+) -> DiscriminatorReward:
+    """GAIL's reward module, to be trained beside the policy.
+
+    Args:
+        cfg: its settings, of which those of its training are the learner's.
+        env: the environment, for its specs.
+        demo: the demonstration that the scaler is fitted to, unless it follows the policy.
+        seed: seed of the weights. The global random state is neither read nor changed.
+    """
+    form = cast(RewardForm, cfg.form)
+    frames, size = _observation(env)
+    if frames:
+        return DiscriminatorReward.for_pixels(
+            env.action_spec, channels=frames, form=form, seed=seed
+        )
+    reward = DiscriminatorReward.for_vectors(
+        size,
         env.action_spec,
         hidden=cfg.hidden,
-        model_hidden=cfg.model_hidden,
-        scale=cfg.scale,
-        normalise=cast(ScalingRule, cfg.normalise),
+        form=form,
+        normalise=cast(DiscriminatorScaling, cfg.normalise),
         clamp=cfg.clamp,
         seed=seed,
     )
-    reward.scaler.fit(demo.transitions["observation"])
+    reward.fit_scaler(demo.transitions["observation"])
     return reward
+
+
+def bottleneck_reward(
+    cfg: BottleneckConfig, env: BatchedEnv, demo: Demonstration, *, seed: int
+) -> BottleneckReward:
+    """VAIL's reward module, to be trained beside the policy.
+
+    Args:
+        cfg: its settings, see :func:`discriminator_reward`.
+        env: the environment, for its specs.
+        demo: the demonstration that the scaler is fitted to, unless it follows the policy.
+        seed: seed of the weights. The global random state is neither read nor changed.
+    """
+    form = cast(RewardForm, cfg.form)
+    frames, size = _observation(env)
+    if frames:
+        return BottleneckReward.for_pixels(
+            env.action_spec, channels=frames, form=form, latent=cfg.latent, seed=seed
+        )
+    reward = BottleneckReward.for_vectors(
+        size,
+        env.action_spec,
+        hidden=cfg.hidden,
+        form=form,
+        normalise=cast(DiscriminatorScaling, cfg.normalise),
+        clamp=cfg.clamp,
+        latent=cfg.latent,
+        seed=seed,
+    )
+    reward.fit_scaler(demo.transitions["observation"])
+    return reward
+
+
+def _observation(env: BatchedEnv) -> tuple[int, int]:
+    """Frames in an observation (0 for vectors), and the size of its last dimension."""
+    spec = env.observation_spec["observation"]
+    return (spec.shape[-3] if spec.dtype == torch.uint8 else 0), spec.shape[-1]

@@ -23,7 +23,7 @@ from torchrl.objectives import ClipPPOLoss
 from giril_rl.configs import TaskConfig
 from giril_rl.envs import gym_factory, make_env
 from giril_rl.networks.distributions import DiagonalGaussian
-from giril_rl.networks.policy import ActorCritic
+from giril_rl.networks.policy import NORMALISED, ActorCritic
 from giril_rl.training.ppo import LEARNER_KEYS
 from giril_rl.training.traced import TracedGradients
 
@@ -89,10 +89,10 @@ def gradients(compiled: bool) -> dict[str, Callable[[], object]]:
         functional=False,
         log_explained_variance=False,
     )
-    shapes = {key: (250, 1) for key in LEARNER_KEYS} | {"action_log_prob": (250,)}
-    shapes[LEARNER_KEYS[0]] = (250, 5)
+    keys = (NORMALISED, *LEARNER_KEYS)
+    shapes = {key: (250, 1) for key in keys} | {"action_log_prob": (250,), NORMALISED: (250, 5)}
     batch = TensorDict({key: torch.randn(shape) for key, shape in shapes.items()}, [250])
-    traced = TracedGradients(loss, keys=LEARNER_KEYS)
+    traced = TracedGradients(loss, keys=keys)
 
     def total() -> torch.Tensor:
         out = loss(batch)

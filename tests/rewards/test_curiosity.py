@@ -15,8 +15,8 @@ class Fixed(nn.Module):
         super().__init__()
         self.function = function
 
-    def forward(self, x):
-        return self.function(x)
+    def forward(self, *x):
+        return self.function(torch.cat(x, -1))
 
 
 def make(discrete=False, **kwargs):

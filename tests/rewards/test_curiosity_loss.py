@@ -48,8 +48,8 @@ def test_both_terms_by_hand():
             super().__init__()
             self.function = function
 
-        def forward(self, x):
-            return self.function(x)
+        def forward(self, *x):
+            return self.function(torch.cat(x, -1))
 
     reward = CuriosityReward(
         Fixed(lambda s: 2 * s),

@@ -19,7 +19,7 @@ LOG = ("kl_approx", "clip_fraction")
 class PPO:
     """ClipPPOLoss as the learner uses it, and batches for it."""
 
-    keys = LEARNER_KEYS
+    keys = (NORMALISED, *LEARNER_KEYS)
     log = LOG
 
     def __init__(self, kind):

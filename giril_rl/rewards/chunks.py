@@ -1,0 +1,38 @@
+"""Rewards of many transitions, some at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+
+def in_chunks(
+    function: Callable[..., Tensor], inputs: tuple[Tensor, ...], batch: torch.Size, size: int | None
+) -> Tensor:
+    """``function(*inputs)``, for batches of pixels, which would take gigabytes at once.
+
+    Args:
+        function: maps tensors of any leading shape to one number for each element of it.
+        inputs: tensors ``(*batch, ...)``.
+        batch: their leading shape.
+        size: most elements at a time; None takes all at once.
+
+    Returns:
+        A tensor of shape ``batch``.
+
+    Examples:
+        >>> double = lambda x: 2 * x.sum(-1)
+        >>> in_chunks(double, (torch.ones(2, 3, 5),), torch.Size([2, 3]), size=4).shape
+        torch.Size([2, 3])
+    """
+    if size is None or batch.numel() <= size:
+        return function(*inputs)
+    flat = [tensor.flatten(0, len(batch) - 1) for tensor in inputs]
+    parts = zip(*(tensor.split(size) for tensor in flat), strict=True)
+    return torch.cat([function(*part) for part in parts]).reshape(batch)
+
+
+PIXELS_AT_ONCE = 256
+"""Transitions of frames that a network takes at a time."""
