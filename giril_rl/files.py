@@ -15,7 +15,7 @@ from typing import Any
 
 from giril_rl.errors import UserError
 
-PACKAGES = ("torch", "torchrl", "tensordict", "gymnasium", "pybullet", "giril-rl")
+PACKAGES = ("torch", "torchrl", "tensordict", "gymnasium", "pybullet", "ale-py", "giril-rl")
 
 
 def temporary_sibling(path: Path) -> Path:
@@ -118,7 +118,7 @@ def installed_versions() -> dict[str, str | None]:
 
     Examples:
         >>> sorted(installed_versions())
-        ['giril_rl', 'gymnasium', 'pybullet', 'python', 'tensordict', 'torch', 'torchrl']
+        ['ale_py', 'giril_rl', 'gymnasium', 'pybullet', 'python', 'tensordict', 'torch', 'torchrl']
     """
     versions: dict[str, str | None] = {"python": ".".join(map(str, sys.version_info[:3]))}
     for name in PACKAGES:

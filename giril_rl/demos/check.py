@@ -6,6 +6,7 @@ these checks refuses one such fault before anything is learned from it.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import torch
@@ -34,14 +35,15 @@ _KEYS: list[NestedKey] = [
 
 def check_demonstration(
     demo: Demonstration,
-    observation_dim: int | None = None,
+    observation_dim: int | Sequence[int] | None = None,
     action_spec: TensorSpec | None = None,
 ) -> None:
     """Refuse a demonstration with a fault that would teach something wrong.
 
     Args:
         demo: what to check; nothing of it is changed.
-        observation_dim: numbers in an observation of the task, if known.
+        observation_dim: numbers in an observation of the task, or its shape, such as
+            ``(4, 84, 84)`` for images, if known.
         action_spec: the task's action spec (TorchRL, batched or not), if known.
 
     Raises:
@@ -104,34 +106,30 @@ def _check_tensors(data: TensorDict) -> None:
 
 
 def _check_tensor(name: str, value: Tensor, length: int) -> None:
-    dtype, width = torch.float32, None  # None: any number of columns
+    dtype, sizes = torch.float32, ["n"]
     if name in ("episode", "step") or (name == "action" and value.ndim == 1):
-        dtype, width = torch.int64, 0
+        dtype, sizes = torch.int64, []
     elif name == "next.reward":
-        width = 1
+        sizes = ["1"]
     elif name in map(_name, _FLAGS):
-        dtype, width = torch.bool, 1
-    wanted = [length] if width == 0 else [length, value.shape[-1] if width is None else width]
-    if value.dtype != dtype or list(value.shape) != wanted:
-        shape = str(wanted) if width is not None else f"[{length}, n]"
-        raise _fault(
-            f"has {name} of {value.dtype} and shape {list(value.shape)}: it must be "
-            f"{dtype} {shape}."
-        )
+        dtype, sizes = torch.bool, ["1"]
+    elif value.dtype == torch.uint8 and name != "action":
+        dtype, sizes = torch.uint8, ["c", "h", "w"]  # Stacked frames.
+    shape = list(value.shape)
+    fits = len(shape) == 1 + len(sizes) and shape[0] == length
+    if value.dtype != dtype or not fits or (sizes == ["1"] and shape[1] != 1):
+        wanted = f"[{', '.join([str(length), *sizes])}]"
+        raise _fault(f"has {name} of {value.dtype} and shape {shape}: it must be {dtype} {wanted}.")
     if value.is_floating_point() and not value.isfinite().all():
         index = _first(~value.isfinite())
         raise _fault(f"has NaN or infinity in {name} at index {index}: record it anew.")
 
 
 def _check_task(
-    data: TensorDict, observation_dim: int | None, action_spec: TensorSpec | None
+    data: TensorDict, observation_dim: int | Sequence[int] | None, action_spec: TensorSpec | None
 ) -> None:
-    dim = data["observation"].shape[-1]
-    if observation_dim is not None and dim != observation_dim:
-        raise _fault(
-            f"has {dim} numbers in an observation and the task has {observation_dim}: "
-            "use a demonstration of this task."
-        )
+    if observation_dim is not None:
+        _check_shape(list(data["observation"].shape[1:]), observation_dim)
     if action_spec is None:
         return
     action = data["action"]
@@ -160,6 +158,17 @@ def _check_task(
             f"has the action {action[index].tolist()} at index {index}, outside "
             f"[{low.tolist()}, {high.tolist()}]: record actions as executed."
         )
+
+
+def _check_shape(found: list[int], wanted: int | Sequence[int]) -> None:
+    wanted = [wanted] if isinstance(wanted, int) else list(wanted)
+    if found == wanted:
+        return
+    if len(found) == len(wanted) == 1:
+        difference = f"{found[0]} numbers in an observation and the task has {wanted[0]}"
+    else:
+        difference = f"observations of shape {found} and the task of shape {wanted}"
+    raise _fault(f"has {difference}: use a demonstration of this task.")
 
 
 def _check_episodes(data: TensorDict, *, may_cut_last: bool) -> None:
@@ -198,7 +207,7 @@ def _check_episodes(data: TensorDict, *, may_cut_last: bool) -> None:
             f"has an episode {int(episode[index])} that stops at index {index} without done: "
             "its end is lost, record it anew."
         )
-    moved = (data["next", "observation"][:-1] != data["observation"][1:]) & ~last[:-1, None]
+    moved = _differ(data["next", "observation"][:-1], data["observation"][1:]) & ~last[:-1]
     if moved.any():
         index = _first(moved)
         raise _fault(
@@ -206,3 +215,11 @@ def _check_episodes(data: TensorDict, *, may_cut_last: bool) -> None:
             f"episode {int(episode[index])}, so actions may not belong to their states; record it "
             "anew."
         )
+
+
+def _differ(left: Tensor, right: Tensor, rows: int = 1024) -> Tensor:
+    """Which rows differ, bool [N]; some at a time, as a game's images may fill the memory."""
+    parts = [
+        (a != b).flatten(1).any(1) for a, b in zip(left.split(rows), right.split(rows), strict=True)
+    ]
+    return torch.cat(parts)

@@ -26,7 +26,8 @@ def to_minari(
     An episode of T actions has T + 1 observations there, the terminal one included. A last episode
     that was cut at the demonstration's length is marked as truncated, which Minari's readers expect
     of every episode. The card is the dataset's description. The place is Minari's own, set by the
-    environment variable ``MINARI_DATASETS_PATH``.
+    environment variable ``MINARI_DATASETS_PATH``. Images are written as they are, whole stacks; of
+    an Atari game the environment that Minari recovers is the bare one, without the preprocessing.
 
     Args:
         demo: what to export.

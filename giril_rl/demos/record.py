@@ -42,6 +42,7 @@ def record_demonstration(
     deterministic: bool = True,
     task: str | None = None,
     expert: dict[str, Any] | None = None,
+    lives: str | None = None,
     show_progress: bool = True,
 ) -> Demonstration:
     """Record transitions as they were, then prove them by check and by replay.
@@ -51,20 +52,24 @@ def record_demonstration(
     is seeded for the recording and put back, so a sampled policy repeats as well.
 
     Args:
-        make_fn: makes the Gymnasium environment: flat observation, Box or Discrete actions.
-        policy: observation float32 [1, d] -> action float [1, a] (Box) or int64 [1] (Discrete);
-            what it returns is played, so it decides itself between mean and sample.
+        make_fn: makes the Gymnasium environment: flat observation or uint8 images [c, h, w], Box
+            or Discrete actions.
+        policy: observation float32 [1, d], or uint8 [1, c, h, w], -> action float [1, a] (Box) or
+            int64 [1] (Discrete); it returns is played, so it decides itself between mean and
+            sample.
         seed: root of the episodes' seeds.
         length: number of transitions; the last episode is cut where it is reached.
         episodes: number of whole episodes, instead of ``length``.
         deterministic: how ``policy`` chooses, for the card.
         task: the task's name, for the card.
         expert: score and source of the policy, for the card; plain JSON values.
+        lives: which lives of a game an episode has, for the card: "first" or "all".
         show_progress: show a progress bar.
 
     Returns:
         The demonstration; its card has ``task``, ``env_id``, ``seed``, ``seeds``, ``length``,
-        ``deterministic``, ``expert``, ``versions``, ``transitions`` and ``episode_returns``.
+        ``deterministic``, ``expert``, ``versions``, ``transitions`` and ``episode_returns``, a
+        game's also ``lives`` and ``actions``, their names.
 
     Raises:
         UserError: unless exactly one of ``length`` and ``episodes`` is positive; for an action that
@@ -120,6 +125,11 @@ def record_demonstration(
         "transitions": len(demo),
         "episode_returns": demo.returns.tolist(),
     }
+    if lives is not None:
+        demo.card["lives"] = lives
+    meanings = getattr(env.unwrapped, "get_action_meanings", None)  # As ale-py calls it.
+    if meanings is not None:
+        demo.card["actions"] = list(meanings())
     check_demonstration(demo)
     verify_by_replay(demo, make_fn)
     return demo
@@ -177,17 +187,17 @@ def _choose(
 
 
 def _stack(rows: list[dict[str, Any]]) -> TensorDict:
-    def column(name: str, dtype: torch.dtype) -> Tensor:
+    def column(name: str, dtype: torch.dtype | None = None) -> Tensor:
         return torch.as_tensor(np.stack([row[name] for row in rows]), dtype=dtype)
 
     discrete = isinstance(rows[0]["action"], int)
-    after = {"observation": column("next", torch.float32)}
+    after = {"observation": column("next")}
     after["reward"] = column("reward", torch.float32).unsqueeze(-1)
     for name in ("done", "terminated", "truncated"):
         after[name] = column(name, torch.bool).unsqueeze(-1)
     return TensorDict(
         {
-            "observation": column("observation", torch.float32),
+            "observation": column("observation"),
             "action": column("action", torch.int64 if discrete else torch.float32),
             "episode": column("episode", torch.int64),
             "step": column("step", torch.int64),

@@ -28,7 +28,19 @@ def as_executed(action: np.ndarray | int, space: gymnasium.Space) -> np.ndarray 
 
 
 def as_recorded(observation: object) -> np.ndarray:
-    """A copy of an environment's observation as float32 [d]; some reuse one array for all steps."""
+    """A copy of an environment's observation, since some reuse one array for all steps.
+
+    Images, uint8 in three dimensions, stay what they are; all else becomes float32 [d].
+
+    Examples:
+        >>> as_recorded(np.zeros((2, 2), dtype=np.uint8)).dtype
+        dtype('float32')
+        >>> as_recorded(np.zeros((4, 84, 84), dtype=np.uint8)).shape
+        (4, 84, 84)
+    """
+    array = np.asarray(observation)
+    if array.dtype == np.uint8 and array.ndim == 3:
+        return array.copy()
     return np.array(observation, dtype=np.float32).reshape(-1)
 
 
@@ -43,8 +55,8 @@ def verify_by_replay(
     Args:
         demo: a demonstration with ``card["seeds"]``.
         make_fn: makes the Gymnasium environment that it was recorded in.
-        tolerance: largest difference that passes; 0 asks for the same bits, which a deterministic
-            simulator gives on the same machine.
+        tolerance: largest difference that passes, of images in grey levels; 0 asks for the same
+            bits, which a deterministic simulator gives on the same machine.
 
     Raises:
         UserError: at the first transition that differs.
@@ -102,6 +114,8 @@ def _compare(
             f"replaying the demonstration gives {name} of shape {list(played.shape)} where "
             f"{list(recorded.shape)} was recorded: it is of another environment."
         )
+    if recorded.dtype == np.uint8:  # Differences of bytes wrap around.
+        recorded, played = recorded.astype(np.int16), played.astype(np.int16)
     difference = float(np.abs(recorded - played).max(initial=0.0))
     if difference <= tolerance:
         return

@@ -83,6 +83,11 @@ class AtariEnv(BatchedEnv):
         """Lives left in each game, int64 ``(num_envs,)``."""
         return self._lives.copy()
 
+    @property
+    def meanings(self) -> list[str]:
+        """Names of the actions, in order."""
+        return self._games[0].meanings
+
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         everyone = range(len(self._games))
         shown = self._play(everyone, tensordict.get("action").tolist())

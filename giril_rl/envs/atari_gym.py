@@ -40,6 +40,10 @@ class AtariGymEnv(gymnasium.Env):
         self.observation_space = gymnasium.spaces.Box(0, 255, shape, np.uint8)
         self.action_space = gymnasium.spaces.Discrete(int(self._env.action_spec.space.n))
 
+    def get_action_meanings(self) -> list[str]:
+        """The actions' names, by ale-py's own name for this method: ``["NOOP", "FIRE", ...]``."""
+        return list(self._env.meanings)
+
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
