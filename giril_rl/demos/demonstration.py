@@ -9,14 +9,22 @@ from typing import Any
 
 import torch
 from tensordict import TensorDict
+from tensordict.utils import NestedKey
 from torch import Tensor
 
 from giril_rl.demos.check import check_demonstration
+from giril_rl.demos.frames import FRAMES_FILE, load_frames, save_frames
 from giril_rl.demos.storage import load_tensors, save_tensors
 from giril_rl.errors import UserError
 from giril_rl.files import read_json, temporary_sibling, write_json
 
 FORMAT_VERSION = 1
+"""Of vectors."""
+IMAGE_FORMAT_VERSION = 2
+"""Of images, which lie in a file of their own."""
+
+
+_IMAGES: list[NestedKey] = ["observation", ("next", "observation")]
 
 
 @dataclass(eq=False)
@@ -25,10 +33,10 @@ class Demonstration:
 
     Args:
         transitions: flat TensorDict, batch [N]: ``observation`` float32 [N, d], raw, before any
-            running normalisation; ``action``, as executed, float32 [N, a] or int64 [N];
-            ``("next", "observation")``, at an episode's end the true terminal observation;
-            ``("next", "reward" | "done" | "terminated" | "truncated")`` [N, 1]; ``episode`` and
-            ``step`` int64 [N], both counted from 0.
+            running normalisation, or images, uint8 [N, c, h, w]; ``action``, as executed, float32
+            [N, a] or int64 [N]; ``("next", "observation")``, at an episode's end the true terminal
+            observation; ``("next", "reward" | "done" | "terminated" | "truncated")`` [N, 1];
+            ``episode`` and ``step`` int64 [N], both counted from 0.
         card: plain JSON values. ``length`` is the fixed number of transitions, which may cut the
             last episode, or None if all episodes are whole; ``seeds`` has one reset seed per
             episode. See :func:`giril_rl.demos.record_demonstration` for the others.
@@ -53,6 +61,11 @@ class Demonstration:
         return self.transitions.shape[0]
 
     @property
+    def has_images(self) -> bool:
+        """Whether observations are images rather than vectors."""
+        return self.transitions["observation"].dtype == torch.uint8
+
+    @property
     def num_episodes(self) -> int:
         """How many episodes there are, the cut one included."""
         return int(self.transitions["episode"].max()) + 1 if len(self) else 0
@@ -71,6 +84,8 @@ class Demonstration:
 
     def save(self, folder: Path | str) -> None:
         """Write ``folder`` at once: a TensorDict memmap of tensors only, and ``card.json``.
+
+        Images lie in ``frames.npz`` instead, each distinct frame once and compressed.
 
         Raises:
             UserError: if the demonstration is not sound, or ``folder`` is there already.
@@ -95,8 +110,15 @@ class Demonstration:
         temporary = temporary_sibling(folder)
         shutil.rmtree(temporary, ignore_errors=True)
         try:
-            save_tensors(temporary / "transitions", self.transitions)
-            write_json(temporary / "card.json", {"format_version": FORMAT_VERSION, **self.card})
+            data, card = self.transitions, {"format_version": FORMAT_VERSION, **self.card}
+            if self.has_images:
+                temporary.mkdir()
+                images = data["observation"], data["next", "observation"]
+                card["format_version"] = IMAGE_FORMAT_VERSION
+                card["frames"] = save_frames(temporary / FRAMES_FILE, *images)
+                data = data.exclude(*_IMAGES)
+            save_tensors(temporary / "transitions", data)
+            write_json(temporary / "card.json", card)
             temporary.replace(folder)
         except BaseException:
             shutil.rmtree(temporary, ignore_errors=True)
@@ -119,12 +141,24 @@ class Demonstration:
                 "or record one anew."
             )
         card = read_json(folder / "card.json")
-        if card.get("format_version") != FORMAT_VERSION:
+        version = card.get("format_version")
+        if version not in (FORMAT_VERSION, IMAGE_FORMAT_VERSION):
             raise UserError(
-                f"{folder} has demonstration format {card.get('format_version')!r} and this "
-                f"version of giril_rl reads only {FORMAT_VERSION}: record it anew."
+                f"{folder} has demonstration format {version!r} and this version of giril_rl reads "
+                f"only {FORMAT_VERSION} and {IMAGE_FORMAT_VERSION}: record it anew."
             )
-        demo = cls(load_tensors(folder / "transitions"), card)
+        if version == IMAGE_FORMAT_VERSION and not (folder / FRAMES_FILE).is_file():
+            raise UserError(
+                f"{folder} has demonstration format {version} and no {FRAMES_FILE}: restore a "
+                "copy, or record it anew."
+            )
+        data = load_tensors(folder / "transitions")
+        if version == IMAGE_FORMAT_VERSION:
+            length = data.shape[0] if data.ndim else 0
+            images = load_frames(folder / FRAMES_FILE, card.get("frames"), length)
+            for key, image in zip(_IMAGES, images, strict=True):
+                data.set(key, image)
+        demo = cls(data, card)
         try:
             check_demonstration(demo)
         except UserError as error:
