@@ -7,7 +7,7 @@ import hashlib
 import json
 import sys
 from collections.abc import Iterator
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -118,11 +118,11 @@ def check_inputs(cfg: RunConfig, expert: ExpertConfig, demo: DemoConfig) -> None
 
 def _given_demonstration(task: TaskConfig, path: str) -> Demonstration:
     env = make_env(task, 1, seed=0)
-    shape, spec = env.observation_spec["observation"].shape, env.action_spec
+    shape, spec = env.observation_spec["observation"].shape[1:], env.action_spec
     env.close()
     demo = Demonstration.load(path)
     try:
-        check_demonstration(demo, shape[-1], spec)
+        check_demonstration(demo, shape, spec)
     except UserError as error:
         raise UserError(f"demo.path={path} does not fit {task.name}: {error}") from None
     return demo
@@ -141,26 +141,48 @@ def obtain_demonstration(
     if demo.path is not None:
         return _given_demonstration(cfg.task, demo.path), None
     source, result = obtain_expert(cfg, expert)
-    settings = {k: v for k, v in asdict(demo).items() if k not in ("path", "subsample")}
-    task = without_added(asdict(with_own_episodes(cfg.task)), "task.")
-    identity = json.dumps([settings, task, result["config_hash"]], sort_keys=True)
-    digest = hashlib.sha256(identity.encode()).hexdigest()[:12]
-    folder = Path(cfg.root) / "demos" / safe(cfg.task.name) / digest
+    task = _recorded_task(cfg.task, demo)
+    identity = _identity(task, demo, result["config_hash"])
+    folder = Path(cfg.root) / "demos" / safe(task.name) / identity
     with made_once(folder, "demonstration"):
         if not folder.exists():
             agent = load_agent(source, cfg.task, read_settings(source)[1])
             recorded = record_demonstration(
-                gym_factory(cfg.task),
+                gym_factory(task),
                 _player(agent, deterministic=demo.deterministic),
                 seed=demo.seed,
                 length=demo.length,
                 episodes=demo.episodes,
                 deterministic=demo.deterministic,
-                task=cfg.task.name,
+                task=task.name,
                 expert={"return_mean": result["return_mean"], "seed": result["seed"]},
+                lives=demo.lives if task.is_atari else None,
             )
             recorded.save(folder)
     return Demonstration.load(folder), result
+
+
+def _recorded_task(task: TaskConfig, demo: DemoConfig) -> TaskConfig:
+    """The task as it is recorded: its own episodes, a game's up to a lost life or whole.
+
+    Examples:
+        >>> pong = TaskConfig(name="pong", env_id="ALE/Pong-v5", episode="game")
+        >>> _recorded_task(pong, DemoConfig(lives="first")).episode
+        'life'
+    """
+    task = with_own_episodes(task)
+    if not task.is_atari:
+        return task
+    return replace(task, episode="life" if demo.lives == "first" else "game")
+
+
+def _identity(task: TaskConfig, demo: DemoConfig, expert: str) -> str:
+    """Twelve hex digits of what decides a demonstration."""
+    unread = {"path", "subsample"} | (set() if task.is_atari else {"lives"})
+    chosen = {key: value for key, value in asdict(demo).items() if key not in unread}
+    parts = without_added({"demo": chosen, "task": asdict(task)})
+    identity = json.dumps([parts["demo"], parts["task"], expert], sort_keys=True)
+    return hashlib.sha256(identity.encode()).hexdigest()[:12]
 
 
 def _player(agent: Agent, *, deterministic: bool) -> Any:
