@@ -7,22 +7,16 @@ are imported only by the commands that need them.
 
 from __future__ import annotations
 
-import argparse
 import os
 import sys
 import traceback
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import NoReturn
 
 from giril_rl import recipes
+from giril_rl.cli_parser import Parser as _Parser
 from giril_rl.errors import INTERRUPTED, UserError
 from giril_rl.nearest import did_you_mean
-
-
-class _Parser(argparse.ArgumentParser):
-    def error(self, message: str) -> NoReturn:
-        raise UserError(f"{message}; see `{self.prog} --help`.")
 
 
 def _ls(argv: Sequence[str]) -> int:
@@ -144,6 +138,13 @@ def _eval(argv: Sequence[str]) -> int:
     return 0
 
 
+def _demo(argv: Sequence[str]) -> int:
+    """Show what a demonstration holds."""
+    from giril_rl.cli_demo import demo
+
+    return demo(argv, _demo.__doc__)
+
+
 def _study(argv: Sequence[str]) -> int:
     """Make the runs of a study, several at a time."""
     parser = _Parser("giril study", description=_study.__doc__, add_help=False)
@@ -184,6 +185,7 @@ _COMMANDS: dict[str, tuple[Callable[[Sequence[str]], int], str]] = {
     "cp": (_cp, "giril cp RECIPE FILE"),
     "run": (_run, "giril run RECIPE [key=value ...] [-m] [--help]"),
     "eval": (_eval, "giril eval RUN [--episodes N] [--seed S]"),
+    "demo": (_demo, "giril demo show PATH [--out FILE.gif] [--fps N]"),
     "study": (_study, "giril study STUDY [key=value ...] [--dry-run]"),
     "report": (_report, "giril report DIR [--out FOLDER]"),
 }

@@ -85,6 +85,7 @@ def test_ls_names_every_recipe_with_its_first_line(capsys):
         (["--help"], {"torch", "torchrl", "hydra", "gymnasium"}),
         (["run", "giril", "--help"], {"torch", "torchrl", "gymnasium"}),
         (["run", "giril", "seed=x"], {"torch", "torchrl", "gymnasium"}),
+        (["demo", "show", "nowhere"], {"torch", "torchrl", "hydra", "gymnasium", "PIL"}),
         (["study", "--help"], {"torch", "torchrl", "hydra", "gymnasium", "ray"}),
         (["study", "smoke", "seed=x"], {"torch", "torchrl", "gymnasium", "ray"}),
     ],
@@ -107,7 +108,7 @@ def test_module_runs_as_a_script_and_returns_its_exit_code():
     ("argv", "sentence"),
     [
         (["rnu"], "'rnu' is not a command; did you mean 'run'?"),
-        (["zzz"], "'zzz' is not a command: choose one of ls, cp, run, eval, study, report."),
+        (["zzz"], "'zzz' is not a command: choose one of ls, cp, run, eval, demo, study, report."),
         (["run"], "name a recipe: `giril ls` shows them."),
         (["run", "girl"], "'girl' is not a recipe; did you mean 'giril'?"),
         (["run", "none.py"], "there is no file none.py; `giril cp RECIPE none.py` makes one."),

@@ -1,0 +1,90 @@
+"""What a demonstration holds, as text."""
+
+from __future__ import annotations
+
+from giril_rl.demos.demonstration import Demonstration
+
+_LIVES = {"first": ", each up to the first lost life", "all": ", each through all lives"}
+_ENDS = {"first": "life lost", "all": "game over"}
+
+
+def describe(demo: Demonstration) -> str:
+    """A table of a demonstration: where it comes from, what was done, how each episode went.
+
+    Args:
+        demo: what to look at; its card may lack anything.
+
+    Examples:
+        >>> import gymnasium
+        >>> from giril_rl.demos import record_demonstration
+        >>> demo = record_demonstration(
+        ...     lambda: gymnasium.make("CartPole-v1"), lambda o: o.new_ones(1).long(),
+        ...     length=15, seed=0, task="cartpole", expert={"return_mean": 9.5, "seed": 1},
+        ... )
+        >>> print(describe(demo))
+        task         cartpole (CartPole-v1)
+        transitions  15
+        episodes     2
+        observation  4 numbers
+        actions      1: 15 (100%)
+        played       deterministic, seed 0
+        expert       return 9.5, seed 1
+        <BLANKLINE>
+        episode  length  score  end
+              0      10   10.0  terminated
+              1       5    5.0  cut
+    """
+    card = demo.card
+    lives = str(card.get("lives"))
+    shape = list(demo.transitions["observation"].shape[1:])
+    images = f"images {' x '.join(map(str, shape))}"
+    played = "deterministic" if card.get("deterministic") else "sampled"
+    rows = {
+        "task": f"{card.get('task')} ({card.get('env_id')})",
+        "transitions": f"{len(demo):,}",
+        "episodes": f"{demo.num_episodes:,}{_LIVES.get(lives, '')}",
+        "observation": images if demo.has_images else _numbers(shape[0]),
+        "actions": _actions(demo),
+        "played": f"{played}, seed {card.get('seed')}",
+        "expert": _expert(card.get("expert")),
+    }
+    width = max(map(len, rows)) + 2
+    lines = [f"{name:<{width}}{value}" for name, value in rows.items()]
+    return "\n".join([*lines, "", *_episodes(demo, _ENDS.get(lives, "terminated"))])
+
+
+def _numbers(count: int) -> str:
+    return "1 number" if count == 1 else f"{count} numbers"
+
+
+def _actions(demo: Demonstration) -> str:
+    action, names = demo.transitions["action"], demo.card.get("actions")
+    if action.ndim > 1:
+        return f"{_numbers(action.shape[1])} from {action.min():.2f} to {action.max():.2f}"
+    values, counts = action.unique(return_counts=True)
+    parts = []
+    for value, count in zip(values.tolist(), counts.tolist(), strict=True):
+        name = names[value] if isinstance(names, list) and value < len(names) else value
+        parts.append(f"{name}: {count:,} ({count / len(demo):.0%})")
+    return ", ".join(parts)
+
+
+def _expert(expert: object) -> str:
+    if not isinstance(expert, dict) or not isinstance(expert.get("return_mean"), int | float):
+        return "not known"
+    return f"return {expert['return_mean']:,.1f}, seed {expert.get('seed')}"
+
+
+def _episodes(demo: Demonstration, ended: str) -> list[str]:
+    after = demo.transitions["next"]
+    last = (demo.lengths.cumsum(0) - 1).tolist()
+    rows = [("episode", "length", "score", "end")]
+    parts = zip(demo.lengths.tolist(), demo.returns.tolist(), last, strict=True)
+    for number, (length, score, row) in enumerate(parts):
+        if after["terminated"][row]:
+            end = ended
+        else:
+            end = "time limit" if after["truncated"][row] else "cut"
+        rows.append((str(number), f"{length:,}", f"{score:,.1f}", end))
+    first, second, third, _ = (max(map(len, column)) for column in zip(*rows, strict=True))
+    return [f"{a:>{first}}  {b:>{second}}  {c:>{third}}  {d}" for a, b, c, d in rows]
