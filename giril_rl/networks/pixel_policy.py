@@ -12,6 +12,7 @@ from torchrl.envs.utils import ExplorationType, exploration_type
 
 from giril_rl.networks.distributions import CategoricalActions
 from giril_rl.networks.pixels import flat_frames
+from giril_rl.networks.space_to_depth import SpaceToDepthConv
 
 HIDDEN = "hidden"
 
@@ -109,7 +110,7 @@ class PixelActor(nn.Module):
         super().__init__()
         self.channels = channels
         self.trunk = nn.Sequential(
-            nn.Conv2d(channels, 32, 8, stride=4),
+            SpaceToDepthConv(channels, 32, 8, stride=4),
             nn.ReLU(),
             nn.Conv2d(32, 64, 4, stride=2),
             nn.ReLU(),
@@ -127,8 +128,9 @@ class PixelActor(nn.Module):
 
     def hidden(self, observation: Tensor) -> Tensor:
         """The trunk's output ``(*batch, 512)`` for uint8 frames ``(*batch, channels, 84, 84)``."""
-        frames = flat_frames(observation, self.channels).to(self.head.weight.dtype) / 255
-        return self.trunk(frames).reshape(*observation.shape[:-3], 512)
+        return self.trunk(flat_frames(observation, self.channels)).reshape(
+            *observation.shape[:-3], 512
+        )
 
     def forward(self, observation: Tensor) -> Tensor:
         """The logits ``(*batch, actions)``."""

@@ -1,0 +1,117 @@
+"""Atari training speed with GIRIL's reward on, paired with stable-baselines3's PPO.
+
+Both train in turns in one process with the same number of torch threads: 8 games, 128 steps, 4
+epochs, minibatches of 256, the same networks (three convolutions and a layer of 512). Ours computes
+GIRIL's reward at beta = 1 and scales it besides; stable-baselines3 learns from the clipped score,
+behind its own wrappers (``make_atari_env``, ``VecFrameStack``).
+
+    pip install -e ".[atari,benchmark]" opencv-python-headless
+    python tests/benchmarks/atari_training.py
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import statistics
+import tempfile
+import time
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+
+import ale_py
+import gymnasium
+import torch
+from stable_baselines3 import PPO
+from stable_baselines3.common.env_util import make_atari_env
+from stable_baselines3.common.vec_env import VecFrameStack
+from torchrl.envs import Compose
+
+from giril_rl.configs import RunConfig, TaskConfig
+from giril_rl.envs import make_env
+from giril_rl.rewards import GenerativeReward
+from giril_rl.task_defaults import apply_task_defaults
+from giril_rl.training import Run, make_agent, train_ppo
+from giril_rl.transforms import BatchMeanReward, IntrinsicReward, ReturnScaling
+
+
+def ours(config: RunConfig) -> Callable[[int], None]:
+    """The whole loop of the recipes, its log and checkpoints included."""
+    env = make_env(config.task, config.ppo.num_envs, seed=0)
+    agent = make_agent(env, config.ppo, seed=0)
+    reward = GenerativeReward.for_pixels(env.action_spec).eval()
+    env.close()
+    relabel = Compose(IntrinsicReward(reward), BatchMeanReward(), ReturnScaling(config.ppo.gamma))
+
+    def train(steps: int) -> None:
+        env = make_env(config.task, config.ppo.num_envs, seed=0)
+        with (
+            tempfile.TemporaryDirectory() as folder,
+            Run.open(Path(folder) / "run", {}, recipe="benchmark") as run,
+        ):
+            train_ppo(env, agent, relabel, config.ppo, steps=steps, seed=0, run=run)
+
+    return train
+
+
+def theirs(config: RunConfig) -> Callable[[int], None]:
+    """stable-baselines3's PPO, its CnnPolicy and its Atari wrappers."""
+    gymnasium.register_envs(ale_py)
+    cfg = config.ppo
+    game = config.task.env_id.removeprefix("ALE/").removesuffix("-v5")
+    model = PPO(
+        "CnnPolicy",
+        VecFrameStack(make_atari_env(f"{game}NoFrameskip-v4", cfg.num_envs, seed=0), 4),
+        n_steps=cfg.rollout,
+        batch_size=cfg.minibatch,
+        n_epochs=cfg.epochs,
+        clip_range=cfg.clip,
+        clip_range_vf=cfg.clip,
+        learning_rate=cfg.lr,
+        ent_coef=cfg.entropy_coef,
+        vf_coef=cfg.value_coef,
+        device="cpu",
+        seed=0,
+    )
+
+    def train(steps: int) -> None:
+        model.learn(steps, reset_num_timesteps=False)
+
+    return train
+
+
+def main() -> None:
+    """Print steps per second of both and the ratio, pair by pair."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--game", default="Breakout", help="as in ALE/Breakout-v5")
+    parser.add_argument("--threads", type=int, default=os.cpu_count())
+    parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--batches", type=int, default=6, help="batches of 1,024 steps a round")
+    args = parser.parse_args()
+    warnings.simplefilter("ignore")
+    torch.set_num_threads(args.threads)
+    task = TaskConfig(name=args.game, env_id=f"ALE/{args.game}-v5")
+    config = apply_task_defaults(RunConfig(task=task))
+    steps = args.batches * config.ppo.num_envs * config.ppo.rollout
+    pair = {"giril_rl": ours(config), "stable-baselines3": theirs(config)}
+    ratios = []
+    for number in range(args.rounds + 1):
+        speed = {}
+        for name, train in pair.items():
+            began = time.perf_counter()
+            train(steps if number else steps // args.batches)
+            speed[name] = steps / (time.perf_counter() - began)
+        if number == 0:
+            continue  # Warming up.
+        ratios.append(speed["giril_rl"] / speed["stable-baselines3"])
+        shown = ", ".join(f"{name} {value:,.0f} steps/s" for name, value in speed.items())
+        print(f"round {number}: {shown}, ratio {ratios[-1]:.2f}", flush=True)
+    print(
+        f"{args.game}, {args.threads} threads: ratio {statistics.median(ratios):.2f} "
+        f"(median of {len(ratios)}, {min(ratios):.2f} to {max(ratios):.2f})"
+    )
+
+
+if __name__ == "__main__":
+    main()
