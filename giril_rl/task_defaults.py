@@ -16,7 +16,7 @@ from giril_rl.schema import flat
 
 @cache
 def _atari() -> dict[str, Any]:
-    text = (shipped_conf() / "atari.yaml").read_text(encoding="utf-8")
+    text = (shipped_conf() / "kind" / "atari.yaml").read_text(encoding="utf-8")
     return flat(yaml.safe_load(text))
 
 
