@@ -90,5 +90,6 @@ def main(cfg: Config, out: Path) -> None:
             method="giril",
             expert=expert,
             demo=demo,
+            reward=reward,
             seeds={"reward": reward_seed, "expert": cfg.expert.seed, "demo": cfg.demo.seed},
         )

@@ -92,5 +92,6 @@ def main(cfg: Config, out: Path) -> None:
             method="vail",
             expert=expert,
             demo=demo,
+            reward=reward,
             seeds={"reward": reward_seed, "expert": cfg.expert.seed, "demo": cfg.demo.seed},
         )

@@ -38,7 +38,7 @@ def run(out, root, *words):
 
 
 def weights(folder):
-    state = load_state(folder / "policy.safetensors")
+    state = load_state(folder / "policy/model.safetensors")
     return {name: value.tolist() for name, value in state.items()}
 
 

@@ -84,7 +84,7 @@ def timeless(folder):
 
 def weights(folder):
     """Every tensor of the policy, bit for bit; the file's own header has no fixed order."""
-    state = load_state(Path(folder) / "policy.safetensors")
+    state = load_state(Path(folder) / "policy/model.safetensors")
     return {name: (str(value.dtype), value.tolist()) for name, value in state.items()}
 
 
@@ -110,9 +110,13 @@ def assert_whole(folder, result, recipe, task, steps):
     assert result["versions"]["torch"] == str(torch.__version__)
     found = [row for row in timeless(folder) if row["phase"] == "ppo"]
     assert [row["step"] for row in found] == list(range(BATCH, steps + 1, BATCH))
-    assert {"config.yaml", "versions.json", "policy.safetensors", "curve.csv", "curve.png"} <= {
-        path.name for path in Path(folder).iterdir()
-    }
+    assert {
+        "config.yaml",
+        "versions.json",
+        "policy",
+        "curve.csv",
+        "curve.png",
+    } <= {path.name for path in Path(folder).iterdir()}
 
 
 @pytest.mark.parametrize("recipe", EXTRA)

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 
 import torch
 from torchrl.envs import EnvBase
 
 from giril_rl.networks.pixel_policy import PixelActorCritic
 from giril_rl.networks.policy import ActorCritic
+from giril_rl.pretrained import made_class
 
 Agent = ActorCritic | PixelActorCritic
 """PPO's policy and value network, of vectors or of pixels; both have the same methods."""
@@ -33,3 +35,41 @@ def agent_for(env: EnvBase, *, hidden: Sequence[int], normalise: bool) -> Agent:
     if observation.dtype == torch.uint8:
         return PixelActorCritic(env.action_spec.space.n, observation.shape[-3])
     return ActorCritic(observation.shape[-1], env.action_spec, hidden=hidden, normalise=normalise)
+
+
+def load_agent_from(folder: Path | str) -> Agent:
+    """The agent that its ``save_pretrained`` wrote, whichever of the two it is.
+
+    Args:
+        folder: the ``policy`` folder of a run, or a copy of it.
+
+    Raises:
+        UserError: as :meth:`giril_rl.pretrained.Pretrained.from_pretrained`.
+
+    Examples:
+        >>> import tempfile
+        >>> folder = PixelActorCritic(4).save_pretrained(tempfile.mkdtemp())
+        >>> policy = load_agent_from(folder).acting()
+        >>> policy.out_keys
+        ['action', 'action_log_prob', 'state_value']
+    """
+    kinds = {kind.__name__: kind for kind in (ActorCritic, PixelActorCritic)}
+    return kinds.get(made_class(folder) or "", ActorCritic).from_pretrained(folder)
+
+
+def fits(agent: Agent, env: EnvBase) -> bool:
+    """Whether an agent's observations and actions are those of an environment.
+
+    Examples:
+        >>> from giril_rl.configs import TaskConfig
+        >>> from giril_rl.envs import make_env
+        >>> env = make_env(TaskConfig(name="cartpole", env_id="CartPole-v1"), num_envs=1, seed=0)
+        >>> fits(PixelActorCritic(2), env)
+        False
+    """
+    like = agent_for(env, hidden=(1,), normalise=False)
+    return type(like) is type(agent) and all(
+        agent.made_with.get(name) == value
+        for name, value in like.made_with.items()
+        if name not in ("hidden", "normalise")
+    )

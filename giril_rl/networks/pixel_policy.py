@@ -13,11 +13,12 @@ from torchrl.envs.utils import ExplorationType, exploration_type
 from giril_rl.networks.distributions import CategoricalActions
 from giril_rl.networks.pixels import flat_frames
 from giril_rl.networks.space_to_depth import SpaceToDepthConv
+from giril_rl.pretrained import Pretrained, remembered
 
 HIDDEN = "hidden"
 
 
-class PixelActorCritic(nn.Module):
+class PixelActorCritic(Pretrained, nn.Module):
     """Three convolutions and a layer of 512 under a categorical policy and a value.
 
     8x8 of stride 4 to 32 channels, 4x4 of stride 2 to 64, 3x3 to 32, then 512, each with ReLU, on
@@ -44,6 +45,7 @@ class PixelActorCritic(nn.Module):
     input_keys: tuple[str, ...] = ("observation",)
     """What the networks in PPO's loss read of a minibatch."""
 
+    @remembered
     def __init__(self, actions: int, channels: int = 4) -> None:
         super().__init__()
         self.normaliser = nn.Identity()

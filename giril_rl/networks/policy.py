@@ -15,11 +15,12 @@ from torchrl.envs.utils import ExplorationType, exploration_type
 from giril_rl.networks.distributions import CategoricalActions, DiagonalGaussian
 from giril_rl.networks.normalise import RunningNormaliser
 from giril_rl.networks.vectors import mlp
+from giril_rl.pretrained import Pretrained, remembered
 
 NORMALISED = "normalised"
 
 
-class ActorCritic(nn.Module):
+class ActorCritic(Pretrained, nn.Module):
     """Separate policy and value networks over one running observation normalisation.
 
     Gaussian actions with a standard deviation that does not depend on the state (first 1), or
@@ -44,6 +45,7 @@ class ActorCritic(nn.Module):
     input_keys: tuple[str, ...] = (NORMALISED,)
     """What the networks in PPO's loss read of a minibatch."""
 
+    @remembered
     def __init__(
         self,
         observation_size: int,

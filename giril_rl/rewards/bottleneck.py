@@ -13,6 +13,7 @@ from torchrl.data import TensorSpec
 from giril_rl.networks.joined import JoinedSequential
 from giril_rl.networks.pixel_discriminators import PixelBottleneck
 from giril_rl.networks.vectors import mlp
+from giril_rl.pretrained import remembered
 from giril_rl.rewards.actions import ActionEncoder
 from giril_rl.rewards.adversarial import RewardForm
 from giril_rl.rewards.discriminator import (
@@ -50,6 +51,7 @@ class BottleneckReward(DiscriminatorReward):
         self.head = head
 
     @classmethod
+    @remembered
     def for_vectors(
         cls,
         observation_dim: int,
@@ -97,6 +99,7 @@ class BottleneckReward(DiscriminatorReward):
         )
 
     @classmethod
+    @remembered
     def for_pixels(
         cls,
         action_spec: TensorSpec,

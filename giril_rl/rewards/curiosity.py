@@ -14,6 +14,7 @@ from torchrl.data import TensorSpec
 from giril_rl.networks.joined import JoinedSequential
 from giril_rl.networks.pixels import ForwardModel, InverseModel, PixelFeatures
 from giril_rl.networks.vectors import mlp
+from giril_rl.pretrained import Pretrained, remembered
 from giril_rl.rewards.actions import ActionEncoder
 from giril_rl.rewards.chunks import PIXELS_AT_ONCE, in_chunks
 from giril_rl.rewards.keys import REWARD_KEYS, TRANSITION_KEYS, check_keys
@@ -37,7 +38,7 @@ def feature_error(predicted: Tensor, features: Tensor) -> Tensor:
     return (predicted - features).square().sum(-1)
 
 
-class CuriosityReward(TensorDictModuleBase):
+class CuriosityReward(Pretrained, TensorDictModuleBase):
     """ICM: ``r = lambda * ||forward(phi(s), a) - phi(s')||^2``, the error in feature space.
 
     Features are those of observations after the scaler. The inverse model, which reads the action
@@ -97,6 +98,7 @@ class CuriosityReward(TensorDictModuleBase):
         self.scale = scale
 
     @classmethod
+    @remembered
     def for_vectors(
         cls,
         observation_dim: int,
@@ -150,6 +152,7 @@ class CuriosityReward(TensorDictModuleBase):
         )
 
     @classmethod
+    @remembered
     def for_pixels(
         cls,
         action_spec: TensorSpec,

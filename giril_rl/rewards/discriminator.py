@@ -17,6 +17,7 @@ from giril_rl.networks.joined import JoinedSequential
 from giril_rl.networks.normalise import RunningNormaliser
 from giril_rl.networks.pixel_discriminators import PixelDiscriminator
 from giril_rl.networks.vectors import mlp
+from giril_rl.pretrained import Pretrained, remembered
 from giril_rl.rewards.actions import ActionEncoder
 from giril_rl.rewards.adversarial import RewardForm, adversarial_reward
 from giril_rl.rewards.chunks import PIXELS_AT_ONCE, in_chunks
@@ -27,7 +28,7 @@ from giril_rl.rewards.scaler import ObservationScaler
 DiscriminatorScaling = Literal["running", "demo_range", "standardise", "raw"]
 
 
-class DiscriminatorReward(TensorDictModuleBase):
+class DiscriminatorReward(Pretrained, TensorDictModuleBase):
     """A reward made of a discriminator's logit, see :func:`~giril_rl.rewards.adversarial_reward`.
 
     Reads observation ``(*batch, d)``, or frames, and action, and writes one reward per transition,
@@ -76,6 +77,7 @@ class DiscriminatorReward(TensorDictModuleBase):
         self.form: RewardForm = form
 
     @classmethod
+    @remembered
     def for_vectors(
         cls,
         observation_dim: int,
@@ -119,6 +121,7 @@ class DiscriminatorReward(TensorDictModuleBase):
         )
 
     @classmethod
+    @remembered
     def for_pixels(
         cls,
         action_spec: TensorSpec,

@@ -17,6 +17,7 @@ from giril_rl.networks.joined import JoinedSequential
 from giril_rl.networks.pixel_decoder import PixelDecoder
 from giril_rl.networks.pixels import PixelEncoder, PixelPrior
 from giril_rl.networks.vectors import mlp
+from giril_rl.pretrained import Pretrained, remembered
 from giril_rl.rewards.actions import ActionEncoder
 from giril_rl.rewards.chunks import PIXELS_AT_ONCE, in_chunks
 from giril_rl.rewards.factored import factored_error
@@ -54,7 +55,7 @@ def blend_action(action_code: Tensor, encoded: Tensor, beta: float) -> Tensor:
     return beta * action_code + (1 - beta) * encoded
 
 
-class GenerativeReward(TensorDictModuleBase):
+class GenerativeReward(Pretrained, TensorDictModuleBase):
     """Eq. 2: ``r = lambda * ||decoder(beta * a + (1 - beta) * a_hat, s) - s'||^2``.
 
     States are compared after the scaler; if the scaler clamps to [-1, 1], so is the prediction.
@@ -127,6 +128,7 @@ class GenerativeReward(TensorDictModuleBase):
         self._table: tuple[object, Tensor] | None = None
 
     @classmethod
+    @remembered
     def for_vectors(
         cls,
         observation_dim: int,
@@ -184,6 +186,7 @@ class GenerativeReward(TensorDictModuleBase):
         )
 
     @classmethod
+    @remembered
     def for_pixels(
         cls,
         action_spec: TensorSpec,

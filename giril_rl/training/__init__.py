@@ -1,7 +1,7 @@
 """The loops that recipes share: fit a reward, PPO on a reward, score, keep and resume."""
 
 from giril_rl.training.adversarial import AdversarialLearner
-from giril_rl.training.agent import load_agent, make_agent, save_agent
+from giril_rl.training.agent import load_agent, make_agent
 from giril_rl.training.clone import clone_behaviour
 from giril_rl.training.control_rewards import control_reward
 from giril_rl.training.evaluate import Scores, evaluate, evaluate_both
@@ -43,7 +43,6 @@ __all__ = [
     "make_agent",
     "obtain_demonstration",
     "return_scaling",
-    "save_agent",
     "train_expert",
     "train_ppo",
 ]

@@ -9,10 +9,10 @@ import torch
 from giril_rl.configs import PPOConfig, TaskConfig
 from giril_rl.envs import BatchedEnv, make_env
 from giril_rl.errors import UserError
-from giril_rl.networks.agents import Agent, agent_for
-from giril_rl.training.checkpoint import load_state, save_state
+from giril_rl.networks.agents import Agent, agent_for, fits, load_agent_from
 
-POLICY_FILE = "policy.safetensors"
+POLICY = "policy"
+"""The folder of a run that holds its policy, see :class:`giril_rl.pretrained.Pretrained`."""
 
 
 def make_agent(env: BatchedEnv, cfg: PPOConfig, seed: int) -> Agent:
@@ -29,27 +29,19 @@ def make_agent(env: BatchedEnv, cfg: PPOConfig, seed: int) -> Agent:
         return agent_for(env, hidden=cfg.hidden, normalise=cfg.normalise_observations)
 
 
-def save_agent(agent: Agent, folder: Path) -> None:
-    """Writes ``policy.safetensors`` into a run's folder."""
-    save_state(folder / POLICY_FILE, dict(agent.state_dict()))
-
-
-def load_agent(folder: Path, task: TaskConfig, cfg: PPOConfig) -> Agent:
-    """The agent that :func:`save_agent` wrote.
+def load_agent(run: Path, task: TaskConfig) -> Agent:
+    """The policy of a finished run.
 
     Raises:
         UserError: if there is none, or it is another task's.
     """
-    path = folder / POLICY_FILE
-    if not path.exists():
-        raise UserError(f"{folder} holds no trained policy: run it to its end first.")
+    folder = run / POLICY
+    if not folder.is_dir():
+        raise UserError(f"{run} holds no trained policy: run it to its end first.")
+    agent = load_agent_from(folder)
     env = make_env(task, 1, seed=0)
-    agent = make_agent(env, cfg, seed=0)
+    fitting = fits(agent, env)
     env.close()
-    try:
-        agent.load_state_dict(load_state(path))
-    except RuntimeError:
-        raise UserError(
-            f"{path} does not fit {task.name} with its settings: it belongs to another run."
-        ) from None
+    if not fitting:
+        raise UserError(f"{folder} does not fit {task.name}: it belongs to another task's run.")
     return agent

@@ -25,7 +25,7 @@ from giril_rl.naming import out_folder, safe, without_added
 from giril_rl.networks.agents import Agent
 from giril_rl.task_defaults import apply_task_defaults
 from giril_rl.training.agent import load_agent, make_agent
-from giril_rl.training.finished import read_result, read_settings
+from giril_rl.training.finished import read_result
 from giril_rl.training.ppo import train_ppo
 from giril_rl.training.result import finish_run
 from giril_rl.training.run import Run
@@ -146,7 +146,7 @@ def obtain_demonstration(
     folder = Path(cfg.root) / "demos" / safe(task.name) / identity
     with made_once(folder, "demonstration"):
         if not folder.exists():
-            agent = load_agent(source, cfg.task, read_settings(source)[1])
+            agent = load_agent(source, cfg.task)
             recorded = record_demonstration(
                 gym_factory(task),
                 _player(agent, deterministic=demo.deterministic),

@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 
 import yaml
 
-from giril_rl.configs import EvalConfig, PPOConfig, TaskConfig
+from giril_rl.configs import EvalConfig, TaskConfig
 from giril_rl.errors import UserError
 from giril_rl.files import read_json, write_json
 from giril_rl.training.agent import load_agent
@@ -32,7 +32,7 @@ def read_result(folder: Path) -> dict[str, Any]:
     return read_json(path)
 
 
-def read_settings(folder: Path) -> tuple[TaskConfig, PPOConfig, EvalConfig]:
+def read_settings(folder: Path) -> tuple[TaskConfig, EvalConfig]:
     """A run's task, policy and evaluation settings, from its ``config.yaml``.
 
     Raises:
@@ -43,7 +43,6 @@ def read_settings(folder: Path) -> tuple[TaskConfig, PPOConfig, EvalConfig]:
         config = yaml.safe_load(path.read_text(encoding="utf-8"))
         return (
             _part(TaskConfig, config["task"]),
-            _part(PPOConfig, config["ppo"]),
             _part(EvalConfig, config["eval"]),
         )
     except (OSError, ValueError, KeyError, TypeError, yaml.YAMLError):
@@ -64,12 +63,12 @@ def evaluate_run(folder: Path, episodes: int | None = None, seed: int | None = N
         UserError: if the folder holds no finished run.
     """
     result = read_result(folder)
-    task, ppo, settings = read_settings(folder)
+    task, settings = read_settings(folder)
     agent: Player
     if result["method"] == RANDOM:
         agent = RandomPolicy.of_task(task, result["seed"])
     else:
-        agent = load_agent(folder, task, ppo)
+        agent = load_agent(folder, task)
     episodes = settings.episodes if episodes is None else episodes
     seed = settings.seed if seed is None else seed
     scores = evaluate_both(agent, task, episodes=episodes, seed=seed)

@@ -9,14 +9,32 @@ from giril_rl.configs import RunConfig
 from giril_rl.demos import Demonstration
 from giril_rl.naming import config_hash
 from giril_rl.networks.agents import Agent
+from giril_rl.pretrained import Pretrained
 from giril_rl.report.curve import write_curve
 from giril_rl.report.losses import loss_points, write_losses
-from giril_rl.training.agent import save_agent
+from giril_rl.training.agent import POLICY
 from giril_rl.training.evaluate import evaluate_both
 from giril_rl.training.metrics import read_metrics
 from giril_rl.training.ppo import Trained
 from giril_rl.training.random_policy import RandomPolicy
 from giril_rl.training.run import Run
+
+REWARD = "reward"
+"""The folder of a run that holds its reward module, see :class:`giril_rl.pretrained.Pretrained`."""
+CARD_KEYS = (
+    "method",
+    "task",
+    "profile",
+    "seed",
+    "env_steps",
+    "return_mean",
+    "return_std",
+    "episodes",
+    "expert_return_mean",
+    "demo_return_mean",
+    "demo_transitions",
+)
+"""What of a result the cards of policy and reward repeat."""
 
 
 def finish_run(
@@ -29,6 +47,7 @@ def finish_run(
     expert: dict[str, Any] | None = None,
     demo: Demonstration | None = None,
     seeds: dict[str, int] | None = None,
+    reward: Pretrained | None = None,
 ) -> dict[str, Any]:
     """Scores the policy on fresh environments and writes policy, curve and ``result.json``.
 
@@ -41,12 +60,11 @@ def finish_run(
         expert: the expert's result, if there was one.
         demo: the demonstration, if there was one.
         seeds: seeds besides those of policy and evaluation.
+        reward: the trained reward module, if there is one, to be kept beside the policy.
 
     Returns:
         What ``result.json`` holds.
     """
-    if not isinstance(agent, RandomPolicy):
-        save_agent(agent, run.folder)
     scores = evaluate_both(agent, cfg.task, episodes=cfg.eval.episodes, seed=cfg.eval.seed)
     result: dict[str, Any] = {
         "method": method,
@@ -67,6 +85,11 @@ def finish_run(
         "versions": run.versions,
         "finished_at": datetime.now(UTC).isoformat(timespec="seconds"),
     }
+    card = {key: result[key] for key in CARD_KEYS}
+    if not isinstance(agent, RandomPolicy):
+        agent.save_pretrained(run.folder / POLICY, card)
+    if reward is not None:
+        reward.save_pretrained(run.folder / REWARD, card)
     rows = read_metrics(run.folder / "metrics.jsonl")
     names: dict[str, Any] = {"recipe": method, "task": cfg.task.name, "seed": cfg.seed}
     if loss_points(rows):

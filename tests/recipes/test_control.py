@@ -43,7 +43,7 @@ def run(recipe, out, root, *more, code=0):
 
 
 def weights(folder):
-    state = load_state(folder / "policy.safetensors")
+    state = load_state(folder / "policy/model.safetensors")
     return {name: value.tolist() for name, value in state.items()}
 
 
@@ -84,7 +84,7 @@ def test_a_random_policy_trains_nothing_and_is_scored_on_the_same_episodes(
     result = run("control", tmp_path / "run", root, "reward=random", "eval.episodes=3")
     assert result["seeds"]["evaluation"] == 10_000 and result["env_steps"] == 0
     assert result["deterministic"]["returns"] == result["returns"]
-    assert not list((tmp_path / "run").glob("*.safetensors"))
+    assert not list((tmp_path / "run").rglob("*.safetensors"))
     other = run("control", tmp_path / "other", root, "reward=random", "eval.episodes=3", "seed=5")
     assert other["returns"] != result["returns"]  # Another seed is another stream of actions.
     monkeypatch.setattr(GymVectorEnv, "_step", None)

@@ -88,7 +88,7 @@ def test_a_cluster_gives_the_same_results_though_a_worker_dies(study):
         one, two = (
             {
                 key: tensor.tolist()
-                for key, tensor in load_state(path.with_name("policy.safetensors")).items()
+                for key, tensor in load_state(path.parent / "policy" / "model.safetensors").items()
             }
             for path in (here, there)
         )

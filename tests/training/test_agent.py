@@ -4,7 +4,7 @@ import torch
 from giril_rl.configs import PPOConfig, TaskConfig
 from giril_rl.envs import make_env
 from giril_rl.errors import UserError
-from giril_rl.training.agent import load_agent, make_agent, save_agent
+from giril_rl.training.agent import load_agent, make_agent
 
 CARTPOLE = TaskConfig(name="cartpole", env_id="CartPole-v1")
 CFG = PPOConfig(hidden=[16])
@@ -25,17 +25,18 @@ def test_an_agent_follows_from_its_seed_alone():
 def test_an_agent_comes_back_with_its_statistics(tmp_path):
     agent = make_agent(make_env(CARTPOLE, 1, seed=0), CFG, seed=3)
     agent.update_normaliser(torch.randn(30, 4))
-    save_agent(agent, tmp_path)
-    loaded = load_agent(tmp_path, CARTPOLE, CFG)
+    agent.save_pretrained(tmp_path / "policy")
+    loaded = load_agent(tmp_path, CARTPOLE)
     for name, value in agent.state_dict().items():
         assert torch.equal(loaded.state_dict()[name], value), name
 
 
 def test_a_missing_or_foreign_policy_is_refused(tmp_path):
     with pytest.raises(UserError, match="holds no trained policy"):
-        load_agent(tmp_path, CARTPOLE, CFG)
-    save_agent(make_agent(make_env(CARTPOLE, 1, seed=0), CFG, seed=0), tmp_path)
+        load_agent(tmp_path, CARTPOLE)
+    agent = make_agent(make_env(CARTPOLE, 1, seed=0), CFG, seed=0)
+    agent.save_pretrained(tmp_path / "policy")
     with pytest.raises(UserError, match="does not fit pendulum"):
-        load_agent(tmp_path, TaskConfig(name="pendulum", env_id="Pendulum-v1"), CFG)
-    with pytest.raises(UserError, match="does not fit cartpole"):
-        load_agent(tmp_path, CARTPOLE, PPOConfig(hidden=[8]))
+        load_agent(tmp_path, TaskConfig(name="pendulum", env_id="Pendulum-v1"))
+    with pytest.raises(UserError, match="does not fit mountain_car"):
+        load_agent(tmp_path, TaskConfig(name="mountain_car", env_id="MountainCar-v0"))
