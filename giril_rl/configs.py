@@ -328,6 +328,11 @@ class RunConfig:
         choices=("tensorboard", "csv", "wandb", "mlflow"),
     )
     threads: int = knob(1, "torch threads; small networks are fastest with 1", low=1)
+    device: str = knob(
+        "cpu",
+        "where networks and batches are; environments stay on the CPU",
+        choices=("cpu", "cuda"),
+    )
     termination: str = knob(
         "ends",
         "ends: nothing comes after a failure; bootstrap: its value continues as after a time limit",

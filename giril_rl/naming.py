@@ -25,6 +25,7 @@ ADDED = {
     "ppo.clip_value": False,
     "demo.lives": "first",
     "clip_reward": False,
+    "device": "cpu",
 }
 """Keys that earlier runs did not have, with the value that they behaved by."""
 

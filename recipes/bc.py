@@ -42,7 +42,7 @@ def main(cfg: Config, out: Path) -> None:
         demo, expert = obtain_demonstration(cfg, cfg.expert, cfg.demo)
         env = make_env(cfg.task, 1, cfg.seed)
 
-        agent = make_agent(env, cfg.ppo, cfg.seed)
+        agent = make_agent(env, cfg.ppo, cfg.seed).to(cfg.device)
         env.close()
         trained = clone_behaviour(
             agent,

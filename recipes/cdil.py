@@ -57,7 +57,7 @@ def main(cfg: Config, out: Path) -> None:
         env = make_env(cfg.task, cfg.ppo.num_envs, cfg.seed)
 
         reward_seed = cfg.seed if cfg.reward.seed is None else cfg.reward.seed
-        reward = curiosity_reward(cfg.reward, env, demo, seed=reward_seed)
+        reward = curiosity_reward(cfg.reward, env, demo, seed=reward_seed).to(cfg.device)
         fit_reward(
             CuriosityRewardLoss(reward, features=cast(FeatureTraining, cfg.reward.features)),
             subsample(demo, cfg.demo.subsample),
@@ -72,7 +72,7 @@ def main(cfg: Config, out: Path) -> None:
             *([BatchMeanReward()] if cfg.batch_mean else []),
             *return_scaling(cfg.scaling, cfg.ppo.gamma),
         )
-        agent = make_agent(env, cfg.ppo, cfg.seed)
+        agent = make_agent(env, cfg.ppo, cfg.seed).to(cfg.device)
         trained = train_ppo(
             env,
             agent,

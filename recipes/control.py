@@ -11,12 +11,13 @@ from pathlib import Path
 from torchrl.envs import Compose
 
 from giril_rl.configs import ControlRunConfig
-from giril_rl.envs import gym_factory, make_env
+from giril_rl.envs import make_env
 from giril_rl.training import (
     RandomPolicy,
     Run,
     Trained,
     check_inputs,
+    check_task,
     control_reward,
     finish_run,
     make_agent,
@@ -38,7 +39,7 @@ def main(cfg: Config, out: Path) -> None:
     if cfg.needs_demonstration:
         check_inputs(cfg, cfg.expert, cfg.demo)
     else:
-        gym_factory(cfg.task)  # Refuses an unknown environment before a folder is made.
+        check_task(cfg)
     player = RandomPolicy.of_task(cfg.task, cfg.seed) if cfg.reward == "random" else None
     with Run.open(out, asdict(cfg), recipe="control", logger=cfg.logger) as run:
         if run.finished:
@@ -58,7 +59,7 @@ def main(cfg: Config, out: Path) -> None:
             *([BatchMeanReward()] if cfg.batch_mean else []),
             *return_scaling(cfg.scaling, cfg.ppo.gamma),
         )
-        agent = make_agent(env, cfg.ppo, cfg.seed)
+        agent = make_agent(env, cfg.ppo, cfg.seed).to(cfg.device)
         trained = train_ppo(
             env,
             agent,

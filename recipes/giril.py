@@ -56,7 +56,7 @@ def main(cfg: Config, out: Path) -> None:
         env = make_env(cfg.task, cfg.ppo.num_envs, cfg.seed)
 
         reward_seed = cfg.seed if cfg.reward.seed is None else cfg.reward.seed
-        reward = generative_reward(cfg.reward, env, demo, seed=reward_seed)
+        reward = generative_reward(cfg.reward, env, demo, seed=reward_seed).to(cfg.device)
         fit_reward(
             GenerativeRewardLoss(reward, alpha=cfg.reward.alpha),
             subsample(demo, cfg.demo.subsample),
@@ -71,7 +71,7 @@ def main(cfg: Config, out: Path) -> None:
             *([BatchMeanReward()] if cfg.batch_mean else []),
             *return_scaling(cfg.scaling, cfg.ppo.gamma),
         )
-        agent = make_agent(env, cfg.ppo, cfg.seed)
+        agent = make_agent(env, cfg.ppo, cfg.seed).to(cfg.device)
         trained = train_ppo(
             env,
             agent,

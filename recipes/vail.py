@@ -54,7 +54,7 @@ def main(cfg: Config, out: Path) -> None:
         env = make_env(cfg.task, cfg.ppo.num_envs, cfg.seed)
 
         reward_seed = cfg.seed if cfg.reward.seed is None else cfg.reward.seed
-        reward = bottleneck_reward(cfg.reward, env, demo, seed=reward_seed)
+        reward = bottleneck_reward(cfg.reward, env, demo, seed=reward_seed).to(cfg.device)
         learner = AdversarialLearner(
             BottleneckLoss(
                 reward,
@@ -72,7 +72,7 @@ def main(cfg: Config, out: Path) -> None:
             IntrinsicReward(reward),
             *return_scaling(cfg.scaling, cfg.ppo.gamma),
         )
-        agent = make_agent(env, cfg.ppo, cfg.seed)
+        agent = make_agent(env, cfg.ppo, cfg.seed).to(cfg.device)
         trained = train_ppo(
             env,
             agent,

@@ -16,7 +16,7 @@ def test_later_keys_leave_the_hashes_of_earlier_runs_as_they_are():
     for key in ("horizon", "after_failure", "expert_steps", "episode"):
         del values["task"][key]
     del values["ppo"]["clip_value"]
-    for key in ("termination", "clip_reward", "out", "root", "logger", "threads"):
+    for key in ("termination", "clip_reward", "device", "out", "root", "logger", "threads"):
         del values[key]
     digest = hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
     assert config_hash(config) == digest[:12]
@@ -32,8 +32,9 @@ def test_later_keys_count_where_they_change_something():
         replace(config, task=replace(TASK, episode="game")),
         replace(config, ppo=PPOConfig(clip_value=True)),
         replace(config, clip_reward=True),
+        replace(config, device="cuda"),
     ]
-    assert len({config_hash(c) for c in [config, *others]}) == 8
+    assert len({config_hash(c) for c in [config, *others]}) == 9
 
 
 def test_the_value_of_a_later_key_is_its_default():

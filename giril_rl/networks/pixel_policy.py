@@ -53,6 +53,11 @@ class PixelActorCritic(Pretrained, nn.Module):
         self.critic = nn.Linear(512, 1)
         _orthogonal(self.critic, 1.0)
 
+    @property
+    def device(self) -> torch.device:
+        """Where its weights are."""
+        return self.critic.weight.device
+
     def hidden(self, observation: Tensor) -> Tensor:
         """The trunk's output ``(*batch, 512)`` for uint8 frames ``(*batch, channels, 84, 84)``."""
         return self.actor.hidden(observation)
@@ -142,8 +147,9 @@ class PixelActor(nn.Module):
 class PixelActingPolicy(TensorDictModuleBase):
     """Samples an action, or takes the mode under ``ExplorationType.DETERMINISTIC``.
 
-    Reads ``"observation"``; writes ``"action"``, ``"action_log_prob"`` and ``"state_value"``, which
-    advantages and the clipped value loss read again.
+    Reads ``"observation"``, wherever it is; writes, in the same place, ``"action"``,
+    ``"action_log_prob"`` and ``"state_value"``, which advantages and the clipped value loss read
+    again.
     """
 
     def __init__(self, agent: PixelActorCritic) -> None:
@@ -155,12 +161,13 @@ class PixelActingPolicy(TensorDictModuleBase):
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the action for ``"observation"`` of any leading shape."""
-        distribution, value = self.agent.distribution_and_value(tensordict.get("observation"))
+        seen = tensordict.get("observation")
+        distribution, value = self.agent.distribution_and_value(seen.to(self.agent.device))
         greedy = exploration_type() == ExplorationType.DETERMINISTIC
         action = distribution.mode if greedy else distribution.sample()
-        tensordict.set("action", action)
-        tensordict.set("action_log_prob", distribution.log_prob(action))
-        return tensordict.set("state_value", value)
+        tensordict.set("action", action.to(seen.device))
+        tensordict.set("action_log_prob", distribution.log_prob(action).to(seen.device))
+        return tensordict.set("state_value", value.to(seen.device))
 
 
 class PixelLossActor(TensorDictModuleBase):

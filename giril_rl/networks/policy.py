@@ -74,6 +74,11 @@ class ActorCritic(Pretrained, nn.Module):
         if isinstance(self.normaliser, RunningNormaliser):
             self.normaliser.update(observation)
 
+    @property
+    def device(self) -> torch.device:
+        """Where its weights are."""
+        return next(self.critic.parameters()).device
+
     def value_network(self) -> TensorDictModule:
         """What advantages have the values computed by, in a batch and where it leads to."""
         return self.critic_for_loss()
@@ -103,8 +108,9 @@ class ActorCritic(Pretrained, nn.Module):
 class ActingPolicy(TensorDictModuleBase):
     """Samples an action, or takes the mode under ``ExplorationType.DETERMINISTIC``.
 
-    Reads raw ``"observation"``; writes ``"action"``, ``"action_log_prob"`` and the normalised
-    observation, which the loss reads again and so need not compute.
+    Reads raw ``"observation"``, wherever it is; writes, in the same place, ``"action"``,
+    ``"action_log_prob"`` and the normalised observation, which the loss reads again and so need not
+    compute.
     """
 
     def __init__(self, agent: ActorCritic) -> None:
@@ -116,14 +122,14 @@ class ActingPolicy(TensorDictModuleBase):
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the action for ``"observation"`` of any leading shape."""
-        normalised = self.agent.normaliser(tensordict.get("observation"))
+        seen = tensordict.get("observation")
+        normalised = self.agent.normaliser(seen.to(self.agent.device))
         distribution = self.agent.distribution(normalised)
         greedy = exploration_type() == ExplorationType.DETERMINISTIC
         action = distribution.mode if greedy else distribution.sample()
-        tensordict.set("action", action)
-        tensordict.set("action_log_prob", distribution.log_prob(action))
-        tensordict.set(NORMALISED, normalised)
-        return tensordict
+        tensordict.set("action", action.to(seen.device))
+        tensordict.set("action_log_prob", distribution.log_prob(action).to(seen.device))
+        return tensordict.set(NORMALISED, normalised.to(seen.device))
 
 
 class LossActor(TensorDictModuleBase):

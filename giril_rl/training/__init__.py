@@ -5,7 +5,7 @@ from giril_rl.training.agent import load_agent, make_agent
 from giril_rl.training.clone import clone_behaviour
 from giril_rl.training.control_rewards import control_reward
 from giril_rl.training.evaluate import Scores, evaluate, evaluate_both
-from giril_rl.training.expert import check_inputs, obtain_demonstration, train_expert
+from giril_rl.training.expert import check_inputs, check_task, obtain_demonstration, train_expert
 from giril_rl.training.fit import fit_reward
 from giril_rl.training.ppo import PPOLearner, Trained, train_ppo
 from giril_rl.training.random_policy import RandomPolicy
@@ -30,6 +30,7 @@ __all__ = [
     "Trained",
     "bottleneck_reward",
     "check_inputs",
+    "check_task",
     "clone_behaviour",
     "control_reward",
     "curiosity_reward",

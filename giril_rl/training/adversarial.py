@@ -47,8 +47,9 @@ class AdversarialLearner:
         self.loss = loss
         self.cfg = cfg
         self._pair_keys = loss.reward.in_keys
-        self._expert = [expert.get(key).contiguous() for key in self._pair_keys]
         self.gradients = TracedGradients(loss, keys=loss.in_keys, log=loss.log_keys)
+        device = self.gradients.parameters[0].device
+        self._expert = [expert.get(key).contiguous().to(device) for key in self._pair_keys]
         self.optimizer = torch.optim.Adam(self.gradients.parameters, lr=cfg.lr, fused=True)
         self._rng = torch.Generator().manual_seed(seed).get_state()
 
@@ -102,5 +103,5 @@ def _drawn(columns: list[Tensor], size: int) -> list[Tensor]:
     rows = len(columns[0])
     if rows <= size:
         return columns
-    index = torch.randperm(rows)[:size]
+    index = torch.randperm(rows)[:size].to(columns[0].device)
     return [column[index] for column in columns]

@@ -164,6 +164,7 @@ def _loss(agent: Agent) -> BCLoss:
 
 
 def _pairs(agent: Agent, data: TensorDictBase) -> TensorDict:
+    data = data.to(agent.device)
     normalised = agent.normaliser(data.get("observation"))
     return TensorDict({NORMALISED: normalised, "action": data.get("action")}, data.shape)
 
@@ -172,4 +173,4 @@ def _minibatch(pairs: TensorDict, size: int, generator: torch.Generator) -> Tens
     if len(pairs) <= size:
         return pairs
     index: Tensor = torch.randint(len(pairs), (size,), generator=generator)
-    return pairs[index]
+    return pairs[index.to(pairs.get("action").device)]

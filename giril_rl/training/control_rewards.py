@@ -37,13 +37,13 @@ def control_reward(
         return ConstantReward(), {}
     seeds = {"expert": cfg.expert.seed, "demo": cfg.demo.seed}
     if cfg.reward == "copy":
-        return copy_reward(cfg.giril, env, demo), seeds
+        return copy_reward(cfg.giril, env, demo).to(cfg.device), seeds
     part = cfg.icm if cfg.reward == "untrained_icm" else cfg.giril
     seed = cfg.seed if part.seed is None else part.seed
     seeds = {"reward": seed, **seeds}
     if cfg.reward == "untrained_icm":
-        return curiosity_reward(cfg.icm, env, demo, seed=seed), seeds
-    reward = generative_reward(cfg.giril, env, demo, seed=seed)
+        return curiosity_reward(cfg.icm, env, demo, seed=seed).to(cfg.device), seeds
+    reward = generative_reward(cfg.giril, env, demo, seed=seed).to(cfg.device)
     if cfg.reward == "untrained_giril":
         return reward, seeds
     fit_reward(
@@ -79,5 +79,6 @@ def moments(reward: TensorDictModuleBase, demo: Demonstration) -> tuple[float, f
         (3.0, 0.0)
     """
     view = demo.transitions.select(*reward.in_keys)
-    values = reward(view).get(reward.out_keys[0]).double()
+    device = next((tensor.device for tensor in reward.state_dict().values()), None)
+    values = reward(view if device is None else view.to(device)).get(reward.out_keys[0]).double()
     return values.mean().item(), values.var(correction=0).item()

@@ -27,6 +27,7 @@ from giril_rl.task_defaults import apply_task_defaults
 from giril_rl.training.agent import load_agent, make_agent
 from giril_rl.training.finished import read_result
 from giril_rl.training.ppo import train_ppo
+from giril_rl.training.randomness import check_device
 from giril_rl.training.result import finish_run
 from giril_rl.training.run import Run
 from giril_rl.training.scaling import return_scaling
@@ -47,13 +48,13 @@ def train_expert(cfg: ExpertRunConfig, folder: Path) -> dict[str, Any]:
     Raises:
         Interrupted: after a checkpoint, if the user asked for it with Ctrl-C.
     """
-    gym_factory(cfg.task)  # Refuses an unknown environment before a folder is made.
+    check_task(cfg)
     with Run.open(folder, asdict(cfg), recipe="expert", logger=cfg.logger) as run:
         if run.result is not None:
             return run.result
         env = make_env(cfg.task, cfg.ppo.num_envs, cfg.seed)
         scaling = return_scaling(cfg.scaling, cfg.ppo.gamma)
-        agent = make_agent(env, cfg.ppo, cfg.seed)
+        agent = make_agent(env, cfg.ppo, cfg.seed).to(cfg.device)
         trained = train_ppo(
             env,
             agent,
@@ -92,6 +93,7 @@ def obtain_expert(cfg: RunConfig, expert: ExpertConfig) -> tuple[Path, dict[str,
             root=cfg.root,
             logger=cfg.logger,
             threads=cfg.threads,
+            device=cfg.device,
             steps=expert.steps_on(cfg.task),
             seed=expert.seed,
             stop_early=expert.stop_early,
@@ -102,18 +104,27 @@ def obtain_expert(cfg: RunConfig, expert: ExpertConfig) -> tuple[Path, dict[str,
         return folder, train_expert(settings, folder)
 
 
+def check_task(cfg: RunConfig) -> None:
+    """Looks for environment and device, before a run's folder is made.
+
+    Raises:
+        UserError: if either is not there.
+    """
+    check_device(cfg.device)
+    gym_factory(cfg.task)
+
+
 def check_inputs(cfg: RunConfig, expert: ExpertConfig, demo: DemoConfig) -> None:
     """Looks at whatever a recipe was given by its path, before its run's folder is made.
 
     Raises:
         UserError: if the task, the expert or the demonstration is not what it should be.
     """
+    check_task(cfg)
     if demo.path is not None:
         _given_demonstration(cfg.task, demo.path)
     elif expert.path is not None:
         obtain_expert(cfg, expert)
-    else:
-        gym_factory(cfg.task)
 
 
 def _given_demonstration(task: TaskConfig, path: str) -> Demonstration:

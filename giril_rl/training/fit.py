@@ -14,6 +14,7 @@ from giril_rl.configs import FitConfig
 from giril_rl.progress import progress
 from giril_rl.rewards.chunks import PIXELS_AT_ONCE
 from giril_rl.training.interrupt import Interrupt, Interrupted
+from giril_rl.training.randomness import restore_rng, rng_state
 from giril_rl.training.traced import TracedGradients
 
 if TYPE_CHECKING:
@@ -52,6 +53,9 @@ def fit_reward(
     keys = loss.in_keys
     gradients = TracedGradients(loss, keys=keys)
     optimizer = torch.optim.Adam(gradients.parameters, lr=cfg.lr, fused=True)
+    device = gradients.parameters[0].device
+    data = data.to(device)
+    held_out = None if held_out is None else held_out.to(device)
     columns = [data.get(key).contiguous() for key in keys]
     generator = torch.Generator().manual_seed(seed)
     torch.manual_seed(seed)
@@ -62,13 +66,14 @@ def fit_reward(
         loss.load_state_dict(saved["loss"])
         optimizer.load_state_dict(saved["optimizer"])
         generator.set_state(saved["minibatches"])
-        torch.set_rng_state(saved["rng"])
+        restore_rng(saved["rng"])
     run.truncate_metrics(phase, step)
     began = time.perf_counter() - seconds
     with Interrupt() as interrupt, progress(cfg.steps, step, "reward model") as bar:
         while step < cfg.steps:
             block = min(cfg.log_every - step % cfg.log_every, cfg.steps - step)
             indices = torch.randint(len(data), (block, cfg.batch), generator=generator)
+            indices = indices.to(device)
             loss.train()
             for index in indices:
                 gradients.step([column[index] for column in columns])
@@ -83,7 +88,7 @@ def fit_reward(
                     "loss": dict(loss.state_dict()),
                     "optimizer": optimizer.state_dict(),
                     "minibatches": generator.get_state(),
-                    "rng": torch.get_rng_state(),
+                    "rng": rng_state(device),
                 }
                 run.save(phase, state)
             if interrupt.requested and step < cfg.steps:

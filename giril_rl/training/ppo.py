@@ -21,6 +21,7 @@ from giril_rl.networks.agents import Agent
 from giril_rl.progress import progress
 from giril_rl.training.episodes import EpisodeTracker
 from giril_rl.training.interrupt import Interrupt, Interrupted
+from giril_rl.training.randomness import restore_rng, rng_state
 from giril_rl.training.traced import TracedGradients
 
 if TYPE_CHECKING:
@@ -61,7 +62,7 @@ def train_ppo(
 
     Args:
         env: the training environments; closed at the end.
-        agent: policy and value network.
+        agent: policy and value network; where its weights are, batches go and learning happens.
         relabel: a transform or a composition of them, called with each batch ``(num_envs, time)``;
             its ``state_dict`` is checkpointed.
         cfg: settings of PPO.
@@ -81,6 +82,7 @@ def train_ppo(
     Raises:
         Interrupted: after a checkpoint, if the user asked for it with Ctrl-C.
     """
+    relabel.to(agent.device)
     learner = PPOLearner(agent, cfg, total_steps=steps, termination=termination)
     tracker = EpisodeTracker(cfg.num_envs)
     recent: deque[float] = deque(maxlen=20)
@@ -112,7 +114,7 @@ def train_ppo(
         learner.optimizer.load_state_dict(saved["optimizer"])
         if learn_reward is not None:
             learn_reward.load_state_dict(saved["reward_learner"])
-        torch.set_rng_state(saved["rng"])
+        restore_rng(saved["rng"])
     run.truncate_metrics(phase, taken)
     next_save = (taken // cfg.checkpoint_every + 1) * cfg.checkpoint_every
     stopped = False
@@ -129,6 +131,8 @@ def train_ppo(
             started = time.perf_counter()
             returns, lengths = tracker(batch)
             recent.extend(returns.tolist())
+            if agent.device.type != "cpu":
+                batch = batch.to(agent.device)
             learned = {} if learn_reward is None else learn_reward.update(batch)
             losses = learner.learn(relabel(batch), taken)
             taken += batch_size
@@ -155,7 +159,7 @@ def train_ppo(
                     "parts": dict(parts.state_dict()),
                     "optimizer": learner.optimizer.state_dict(),
                     "simulator": env.simulator_state(),
-                    "rng": torch.get_rng_state(),
+                    "rng": rng_state(agent.device),
                     "reward_learner": None if learn_reward is None else learn_reward.state_dict(),
                 }
                 run.save(phase, state)
@@ -250,7 +254,7 @@ class PPOLearner:
         flat = [batch.get(key).flatten(0, 1) for key in self.keys]
         for _ in range(cfg.epochs):
             logs: list[dict[str, torch.Tensor]] = []
-            order = torch.randperm(batch.numel())
+            order = torch.randperm(batch.numel()).to(self.agent.device)
             for minibatch in zip(*(x[order].split(cfg.minibatch) for x in flat), strict=True):
                 logs.append(self.gradients.step(minibatch))
                 self.optimizer.step()

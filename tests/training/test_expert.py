@@ -32,7 +32,6 @@ class Random:
 def obtain(monkeypatch, tmp_path):
     result = {"config_hash": "0123456789ab", "return_mean": 3.5, "seed": 7}
     monkeypatch.setattr(expert, "obtain_expert", lambda *_: (Path("expert"), result))
-    monkeypatch.setattr(expert, "read_settings", lambda folder: (None, None, None))
     monkeypatch.setattr(expert, "load_agent", lambda *_: Random(actions=4))
 
     def obtain(task, demo):
