@@ -13,6 +13,7 @@ from giril_rl.networks.normalise import RunningNormaliser
 from giril_rl.rewards import ObservationScaler
 
 DIM = 3
+FRAMES = (4, 84, 84)
 ENTRIES = ("observation", "action", "next_observation")
 PLAIN = {
     "observation": "observation",
@@ -67,6 +68,14 @@ class Case:
     depends_on: tuple[str, ...]
     deterministic: bool
     learned: bool
+    pixels: bool = False
+
+    @property
+    def spec(self) -> TensorSpec:
+        """The action spec; that of frames is Breakout's."""
+        if self.pixels:
+            return Categorical(4)
+        return Categorical(3) if self.discrete else Bounded(-1.0, 1.0, shape=(1,))
 
 
 CASES: list[Case] = []
@@ -79,8 +88,9 @@ def register(
     depends_on: tuple[str, ...] = ENTRIES,
     deterministic: bool = True,
     learned: bool = True,
+    pixels: bool = False,
 ) -> None:
-    """Adds a reward to the checked ones, for Box and for Discrete actions.
+    """Adds a reward to the checked ones, for Box and for Discrete actions; of pixels, for Discrete.
 
     Args:
         name: its name in test ids.
@@ -89,21 +99,17 @@ def register(
         deterministic: whether equal transitions get equal rewards; a noisy one has to draw from a
             generator of its own, and equal numbers of draws from equal states have to be equal.
         learned: whether it has weights or statistics, which decide its value.
+        pixels: whether it reads stacks of frames rather than vectors.
     """
-    for discrete in (False, True):
-        kind = "discrete" if discrete else "box"
-        case = Case(f"{name}-{kind}", build, discrete, depends_on, deterministic, learned)
-        CASES.append(case)
-
-
-def spec(discrete: bool) -> TensorSpec:
-    """The action specs that all rewards are checked with."""
-    return Categorical(3) if discrete else Bounded(-1.0, 1.0, shape=(1,))
+    for discrete in (True,) if pixels else (False, True):
+        kind = "pixels" if pixels else "discrete" if discrete else "box"
+        claims = (depends_on, deterministic, learned, pixels)
+        CASES.append(Case(f"{name}-{kind}", build, discrete, *claims))
 
 
 def build(case: Case, *, seed: int = 0, keys: dict = PLAIN, fit: bool = True):
     """A reward with its scalers fitted to observations that ``seed`` decides."""
-    module = case.build(Setting(spec(case.discrete), keys, seed))
+    module = case.build(Setting(case.spec, keys, seed))
     observations = demonstration(seed)
     for part in module.modules() if fit else ():
         if isinstance(part, ObservationScaler):
@@ -126,16 +132,25 @@ def transitions(case: Case, *batch: int, keys: dict = PLAIN, seed: int = 0) -> T
     def inside(size: int) -> torch.Tensor:
         return torch.rand(*batch, size, generator=generator) * 1.6 - 0.8
 
+    def observe() -> torch.Tensor:
+        if case.pixels:
+            return torch.randint(256, (*batch, *FRAMES), generator=generator, dtype=torch.uint8)
+        return 1 + inside(DIM)
+
     action = torch.randint(3, batch, generator=generator) if case.discrete else inside(1)
-    values = {
-        "observation": 1 + inside(DIM),
-        "action": action,
-        "next_observation": 1 + inside(DIM),
-    }
+    values = {"observation": observe(), "action": action, "next_observation": observe()}
     out = TensorDict(batch_size=batch)
     for name, value in values.items():
         out.set(keys[name], value)
     return out
+
+
+def far_away(case: Case, size: int) -> TensorDict:
+    """Transitions between states that no expert saw; of frames, from black to white."""
+    far = transitions(case, size)
+    for key, sign, colour in (("observation", 1, 0), (("next", "observation"), -1, 255)):
+        far[key] = torch.full_like(far[key], colour) if case.pixels else sign * 1e4 * far[key]
+    return far
 
 
 def rewards(module: TensorDictModuleBase, batch: TensorDict, keys: dict = PLAIN) -> torch.Tensor:

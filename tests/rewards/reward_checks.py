@@ -6,10 +6,7 @@ its own claims, the exceptions included: what it says it does not read must not 
 """
 
 import copy
-import functools
-from collections.abc import Callable
 
-import gymnasium
 import torch
 from reward_cases import (
     ENTRIES,
@@ -18,14 +15,14 @@ from reward_cases import (
     Case,
     assert_equal,
     build,
+    far_away,
     rewards,
     transitions,
 )
-from tensordict import TensorDict
-from tensordict.nn import TensorDictModule, TensorDictModuleBase
+from reward_worlds import MakeEnv, world_of
+from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import TransformedEnv
 
-from giril_rl.envs import GymVectorEnv
 from giril_rl.training.checkpoint import load_state, save_state
 from giril_rl.transforms import IntrinsicReward
 
@@ -37,10 +34,7 @@ def check_one_value_per_transition(case: Case) -> None:
         value = rewards(module, transitions(case, *shape))
         assert value.shape == (*shape, 1)
         assert value.dtype == torch.float32
-    far = transitions(case, 5)
-    far["observation"] *= 1e4
-    far["next", "observation"] *= -1e4
-    assert rewards(module, far).isfinite().all()
+    assert rewards(module, far_away(case, 5)).isfinite().all()
 
 
 def check_batch_shape_does_not_matter(case: Case) -> None:
@@ -87,7 +81,8 @@ def check_no_gradient_reaches_the_policy(case: Case) -> None:
     """Not even from a reward in training, of an action that carries a gradient."""
     module, batch = build(case).train(), transitions(case, 8)
     batch["next", "reward"] = torch.zeros(8, 1)
-    batch["observation"].requires_grad_()
+    if not case.pixels:
+        batch["observation"].requires_grad_()
     if not case.discrete:
         batch["action"] = batch["action"].requires_grad_() * 0.5
     out = IntrinsicReward(module)(batch)
@@ -147,36 +142,12 @@ def check_nested_keys(case: Case) -> None:
     assert_equal(out["next", "reward"], rewards(plain, batch))
 
 
-MakeEnv = Callable[..., gymnasium.Env]
-
-
-@functools.cache
-def _played(make_env: MakeEnv, discrete: bool) -> TensorDict:
-    return _rollout(_env(make_env, discrete), discrete)
-
-
-def _env(make_env: MakeEnv, discrete: bool) -> GymVectorEnv:
-    return GymVectorEnv(lambda: make_env(discrete=discrete), 4, seed=0, max_episode_steps=100)
-
-
-def _rollout(env, discrete: bool) -> TensorDict:
-    def act(observation):
-        if discrete:
-            return (7 * observation.abs().sum(-1)).long() % 3
-        return torch.sin(3 * observation.sum(-1, keepdim=True))
-
-    policy = TensorDictModule(act, ["observation"], ["action"])
-    batch = env.rollout(10, policy, break_when_any_done=False)
-    assert 2 <= batch["next", "done"].sum() <= 20
-    return batch
-
-
 def check_environment_and_batch_agree(case: Case, make_env: MakeEnv) -> None:
     """The same numbers step by step in an environment as on the batch that it gave."""
-    module = build(case)
-    batch = IntrinsicReward(module)(_played(make_env, case.discrete).clone())
-    env = TransformedEnv(_env(make_env, case.discrete), IntrinsicReward(copy.deepcopy(module)))
-    stepped = _rollout(env, case.discrete)
+    module, world = build(case), world_of(case, make_env)
+    batch = IntrinsicReward(module)(world.played.clone())
+    env = TransformedEnv(world.env(), IntrinsicReward(copy.deepcopy(module)))
+    stepped = world.play(env)
     assert_equal(stepped["next", "extrinsic_reward"], batch["next", "extrinsic_reward"])
     assert stepped["next", "reward"].shape == batch["next", "reward"].shape
     if case.deterministic:
@@ -184,24 +155,17 @@ def check_environment_and_batch_agree(case: Case, make_env: MakeEnv) -> None:
 
 
 def check_terminal_step(case: Case, make_env: MakeEnv) -> None:
-    """The last step of an episode is worth what its true end makes of it, not the next start.
-
-    The environment observes (start, step, last action), so that the true end is known by heart.
-    """
-    module, batch = build(case), _played(make_env, case.discrete).clone()
-    done = batch["next", "done"].squeeze(-1)
-    start, step, _ = batch["observation"].unbind(-1)
-    action = batch["action"].float().reshape(step.shape)
+    """The last step of an episode is worth what its true end makes of it, not the next start."""
+    module, world = build(case), world_of(case, make_env)
+    batch = world.played.clone()
     true = batch.select("observation", "action")
-    true["next", "observation"] = torch.stack((start, step + 1, action), -1)
+    true["next", "observation"] = world.true_next
     expected = rewards(module, true)
     relabelled = IntrinsicReward(copy.deepcopy(module))(batch)["next", "reward"]
     assert_equal(relabelled, expected)
     if "next_observation" in case.depends_on:
+        done = batch["next", "done"].squeeze(-1)
         wrong = true.clone()
-        began = torch.stack((start, torch.zeros_like(step), torch.zeros_like(step)), -1)
-        wrong["next", "observation"] = torch.where(
-            done.unsqueeze(-1), began, true["next", "observation"]
-        )
+        wrong["next", "observation"][done] = world.next_start[done]
         differs = (rewards(module, wrong) != expected).squeeze(-1)
         assert torch.equal(differs, done)

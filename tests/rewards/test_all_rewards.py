@@ -18,6 +18,7 @@ from giril_rl.rewards import (
     GenerativeReward,
     NoiseReward,
     ObservationScaler,
+    PixelScaler,
 )
 
 RULES = ("demo_range", "standardise", "raw")
@@ -44,6 +45,14 @@ def adversarial(cls, **kwargs):
 def copied(c: Setting):
     scaler = ObservationScaler(c.dim, rule="standardise")
     return CopyReward(scaler, **c.reads("observation", "next_observation"))
+
+
+def of_pixels(cls, *entries, **kwargs):
+    return lambda c: cls.for_pixels(c.spec, seed=c.seed, **kwargs, **c.reads(*entries))
+
+
+def copied_pixels(c: Setting):
+    return CopyReward(PixelScaler(), **c.reads("observation", "next_observation"))
 
 
 for rule, prior, beta in itertools.product(RULES, ("standard", "conditional"), (1.0, 0.9)):
@@ -75,6 +84,16 @@ register(
     lambda c: AffineReward(generative(beta=0.9)(c), shift=-0.3),
     deterministic=False,
 )
+
+for prior, beta in itertools.product(("standard", "conditional"), (1.0, 0.9)):
+    build = of_pixels(GenerativeReward, prior=prior, beta=beta)
+    register(f"giril-{prior}-{beta}", build, deterministic=beta == 1, pixels=True)
+register("icm", of_pixels(CuriosityReward), pixels=True)
+for name, cls in (("gail", DiscriminatorReward), ("vail", BottleneckReward)):
+    pair = ("observation", "action")
+    register(name, of_pixels(cls, *pair), depends_on=pair, pixels=True)
+states = ("observation", "next_observation")
+register("copy", copied_pixels, depends_on=states, learned=False, pixels=True)
 
 every_reward = pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
 
