@@ -125,7 +125,7 @@ class GenerativeReward(Pretrained, TensorDictModuleBase):
         self.beta = beta
         self.scale = scale
         self._generator = torch.Generator().manual_seed(seed)
-        self._table: tuple[object, Tensor] | None = None
+        self._table: tuple[list[Tensor], Tensor] | None = None
 
     @classmethod
     @remembered
@@ -291,9 +291,10 @@ class GenerativeReward(Pretrained, TensorDictModuleBase):
     def _action_table(self) -> tuple[Tensor, Tensor]:
         """The decoder's ``action_table`` and ``state_weight``, kept until its weights change."""
         decoder = cast(PixelDecoder, self.decoder)
-        now = [(weight.data_ptr(), weight._version) for weight in decoder.parameters()]
-        if self._table is None or self._table[0] != now:
-            self._table = now, decoder.action_table()
+        # The values are compared, for a fused optimiser's step changes no tensor's version.
+        weights = list(decoder.parameters())
+        if self._table is None or not all(map(_same, self._table[0], weights)):
+            self._table = [weight.clone() for weight in weights], decoder.action_table()
         return self._table[1], decoder.state_weight
 
     def _encoded_action(self, observation: Tensor, following: Tensor) -> Tensor:
@@ -310,3 +311,8 @@ class GenerativeReward(Pretrained, TensorDictModuleBase):
     def set_extra_state(self, state: Tensor) -> None:
         """Restores the noise generator."""
         self._generator.set_state(state.cpu())
+
+
+def _same(one: Tensor, other: Tensor) -> bool:
+    alike = (one.device, one.dtype) == (other.device, other.dtype)
+    return alike and torch.equal(one, other)
