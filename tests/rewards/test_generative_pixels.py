@@ -1,0 +1,238 @@
+"""GIRIL's reward and loss of frames against the equations written out."""
+
+import copy
+
+import pytest
+import torch
+import torch.nn.functional as F
+from pixel_data import ACTIONS, convolved, decoded, run_in, scaled, transitions
+from tensordict import TensorDict
+from torch import nn
+from torch.distributions import Independent, Normal, kl_divergence
+from torchrl.data import Categorical
+
+from giril_rl.rewards import (
+    ActionEncoder,
+    GenerativeReward,
+    GenerativeRewardLoss,
+    PixelScaler,
+    generative,
+)
+
+
+def model(**kwargs):
+    """A reward whose prediction leaves [-1, 1] here and there."""
+    reward = GenerativeReward.for_pixels(Categorical(ACTIONS), **kwargs)
+    with torch.no_grad():
+        reward.decoder.last.weight.mul_(4)
+    return reward
+
+
+def factored(reward, data):
+    """The reward as PPO gets it."""
+    with torch.no_grad():
+        return reward(data.clone())["next", "intrinsic_reward"]
+
+
+def literal(reward, data):
+    """The reward where gradients are wanted: the whole decoder for each transition."""
+    return reward(data.clone())["next", "intrinsic_reward"].detach()
+
+
+# Both ways to the reward at beta = 1
+
+
+@pytest.mark.parametrize("clamp", [True, False])
+@pytest.mark.parametrize("batch", [(6,), (2, 3), ()])
+def test_the_factored_way_is_the_literal_one(clamp, batch):
+    reward, data = model(clamp=clamp, scale=0.3), transitions(*batch)
+    calls = []
+    reward.decoder.register_forward_hook(lambda *_: calls.append(1))
+    expected = literal(reward, data)
+    assert len(calls) == 1
+    found = factored(reward, data)
+    assert len(calls) == 1  # Not the decoder as it is.
+    assert found.shape == (*batch, 1)
+    torch.testing.assert_close(found, expected, rtol=1e-5, atol=0)
+    by_hand = decoded(
+        reward.decoder,
+        torch.eye(ACTIONS)[data["action"]].reshape(-1, ACTIONS),
+        scaled(data["observation"]).reshape(-1, 4, 84, 84),
+    )
+    by_hand = by_hand.clamp(-1, 1) if clamp else by_hand
+    error = by_hand - scaled(data["next", "observation"]).reshape(by_hand.shape)
+    error = 0.3 * error.square().sum((-3, -2, -1)).reshape(*batch, 1)
+    torch.testing.assert_close(found, error.detach(), rtol=1e-5, atol=0)
+
+
+def test_the_clamp_matters_here():
+    data = transitions(3)
+    assert (factored(model(), data) < 0.9 * factored(model(clamp=False), data)).all()
+
+
+@pytest.mark.parametrize("beta", [1.0, 0.9])
+def test_the_literal_way_takes_some_transitions_at_a_time(beta, monkeypatch):
+    reward, data = model(beta=beta).eval(), transitions(2, 3)
+    sizes = []
+    reward.decoder.register_forward_hook(lambda _, inputs, out: sizes.append(len(out)))
+    whole = literal(copy.deepcopy(reward), data)
+    monkeypatch.setattr(generative, "PIXELS_AT_ONCE", 4)
+    sizes.clear()
+    parts = literal(reward, data)
+    assert sizes == [4, 2]
+    if beta == 1:
+        torch.testing.assert_close(parts, whole, rtol=1e-5, atol=0)
+
+
+def adam(reward, data):
+    optimiser = torch.optim.Adam(reward.decoder.parameters(), lr=1e-2, fused=True)
+    reward(data.clone())["next", "intrinsic_reward"].mean().backward()
+    optimiser.step()
+
+
+def load(reward, data):
+    reward.load_state_dict(model(seed=5).state_dict())
+
+
+def through_data(reward, data):
+    reward.decoder.last.bias.data.add_(0.5)
+
+
+def replaced(reward, data):
+    reward.decoder.last.bias = nn.Parameter(torch.full((4,), 0.3))
+
+
+@pytest.mark.parametrize("change", [adam, load, through_data, replaced])
+def test_the_weights_may_change_in_between(change):
+    reward, data = model(), transitions(4)
+    before = factored(reward, data)
+    change(reward, data)
+    after = factored(reward, data)
+    assert ((after - before).abs() > 1e-4 * before).all()  # Ten times the tolerance
+    torch.testing.assert_close(after, literal(reward, data), rtol=1e-5, atol=0)
+
+
+def test_a_copy_has_weights_of_its_own():
+    reward, data = model(), transitions(4)
+    before = factored(reward, data)
+    twin = copy.deepcopy(reward)
+    adam(twin, data)
+    torch.testing.assert_close(factored(twin, data), literal(twin, data), rtol=1e-5, atol=0)
+    assert torch.equal(factored(reward, data), before)
+
+
+def test_nothing_is_computed_twice_for_the_same_weights(monkeypatch):
+    reward, data = model(), transitions(2)
+    first = factored(reward, data)
+    monkeypatch.setattr(type(reward.decoder), "action_table", None)
+    assert torch.equal(factored(reward, data), first)
+
+
+# Equation 2
+
+
+class Decoder(nn.Module):
+    """Predicts the state plus the code's numbers, one for each channel."""
+
+    def forward(self, code, s):
+        return s + code[..., None, None]
+
+
+class Encoder(nn.Module):
+    """Is sure of the second action, whatever it sees."""
+
+    def forward(self, s, following):
+        mu = torch.tensor([0.0, 80.0]).expand(*s.shape[:-3], 2)
+        return torch.cat((mu, torch.full_like(mu, -80.0)), -1)
+
+
+@pytest.mark.parametrize(
+    ("beta", "clamp", "expected"),
+    [
+        # s = (-1, 0.6), code (1, 0), s_hat = (0, 0.6), s' = (-1, 1).
+        (1.0, True, 1.0 + 0.16),
+        (1.0, False, 1.0 + 0.16),
+        # The code is (0.25, 0.75): s_hat = (-0.75, 1.35), which is clamped to 1.
+        (0.25, True, 0.0625),
+        (0.25, False, 0.0625 + 0.1225),
+    ],
+)
+def test_equation_2_by_hand(beta, clamp, expected):
+    reward = GenerativeReward(
+        Encoder(),
+        Decoder(),
+        scaler=PixelScaler(clamp=clamp),
+        actions=ActionEncoder(Categorical(2)),
+        beta=beta,
+        scale=0.5,
+    )
+    s, following = (
+        torch.tensor(x, dtype=torch.uint8).view(1, 2, 1, 1) for x in ([0, 204], [0, 255])
+    )
+    action = torch.tensor([0])
+    data = TensorDict({"observation": s, "action": action, "next": {"observation": following}}, [1])
+    assert factored(reward, data).item() == pytest.approx(0.5 * expected, rel=1e-5)
+
+
+# Equation 1
+
+
+@pytest.mark.parametrize("prior", ["standard", "conditional"])
+def test_the_three_terms_by_hand(prior):
+    reward = model(prior=prior, scale=0.7, seed=1)
+    data = transitions(6)
+    loss = run_in(GenerativeRewardLoss(reward), data)
+    torch.manual_seed(0)
+    with torch.no_grad():
+        out = loss(data)
+        torch.manual_seed(0)
+        s, following = scaled(data["observation"]), scaled(data["next", "observation"])
+        body, head = reward.encoder.body, reward.encoder.head
+        latent = F.linear(convolved(body, torch.cat((s, following), 1)), head.weight, head.bias)
+        mu, logvar = latent[:, :ACTIONS], latent[:, ACTIONS:]
+        z = mu + torch.exp(logvar / 2) * torch.randn(6, ACTIONS)
+        error = F.mse_loss(decoded(reward.decoder, z, s), following, reduction="none")
+        p = Normal(torch.zeros_like(mu), torch.ones_like(mu))
+        if prior == "conditional":
+            network = reward.prior_network
+            features = convolved(network.features.body, s)
+            given = F.linear(features, network.head.weight, network.head.bias)
+            p = Normal(given[:, :ACTIONS], torch.exp(given[:, ACTIONS:] / 2))
+        q = Independent(Normal(mu, torch.exp(logvar / 2)), 1)
+        kl = kl_divergence(q, Independent(p, 1))
+        entropy = F.cross_entropy(z, data["action"])
+    expected = {
+        "loss_reconstruction": 0.7 * error.sum((1, 2, 3)).mean(),
+        "loss_kl": kl.mean(),
+        "loss_action": 100 * entropy,
+    }
+    for name, value in expected.items():
+        torch.testing.assert_close(out[name], value, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("prior", ["standard", "conditional"])
+def test_every_parameter_gets_a_gradient(prior):
+    loss = GenerativeRewardLoss(model(prior=prior))
+    sum(loss(transitions(6)).values()).backward()
+    for name, parameter in loss.named_parameters():
+        # Batch normalisation takes off what a convolution's bias adds.
+        if "body" not in name or not name.endswith("bias"):
+            assert parameter.grad is not None and parameter.grad.abs().sum() > 0, name
+
+
+def test_the_loss_falls_within_a_few_steps():
+    torch.manual_seed(0)
+    loss, data = GenerativeRewardLoss(model()), transitions(8)
+    # Even frames, brighter after a higher action: random ones cannot be foreseen.
+    data["observation"] = data["observation"][..., :1, :1, :1].expand_as(data["observation"])
+    brighter = data["observation"] // 2 + 30 * data["action"].view(8, 1, 1, 1).byte()
+    data["next", "observation"] = brighter
+    optimiser = torch.optim.Adam(loss.parameters(), lr=1e-3)
+    totals = []
+    for _ in range(8):
+        optimiser.zero_grad()
+        total = sum(loss(data).values())
+        total.backward()
+        optimiser.step()
+        totals.append(total.item())
+    assert totals[-1] < 0.8 * totals[0]
