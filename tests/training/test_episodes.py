@@ -89,3 +89,16 @@ def test_only_scored_steps_count():
     returns, lengths = tracker(data)
     assert returns.tolist() == [16.0 + 32.0 + 3.0] and lengths.tolist() == [4]
     assert tracker.running_return.tolist() == [60.0] and tracker.running_length.tolist() == [4]
+
+
+def test_an_episode_of_atari_is_a_whole_game():
+    """By hand: lives end after steps 2 and 4, the game after step 4, and again after 1 step."""
+    tracker = EpisodeTracker(1)
+    done = torch.tensor([[False, True, False, True, True, False]])
+    data = batch(torch.tensor([[1.0, 2.0, 4.0, 8.0, 16.0, 32.0]]), done)
+    over = torch.tensor([[False, False, False, True, True, False]])
+    data["next", "game_over"] = over.unsqueeze(-1)
+    returns, lengths = tracker(data)
+    assert returns.tolist() == [15.0, 16.0] and lengths.tolist() == [4, 1]
+    returns, lengths = tracker(data)
+    assert returns.tolist() == [47.0, 16.0] and lengths.tolist() == [5, 1]

@@ -3,10 +3,16 @@ import signal
 import pytest
 import torch
 from tensordict import TensorDict
+from torch import nn
 from torchrl.data import Bounded, Categorical
 
 from giril_rl.configs import FitConfig
-from giril_rl.rewards import GenerativeReward, GenerativeRewardLoss
+from giril_rl.rewards import (
+    CuriosityReward,
+    CuriosityRewardLoss,
+    GenerativeReward,
+    GenerativeRewardLoss,
+)
 from giril_rl.training import fit
 from giril_rl.training.interrupt import Interrupted
 from giril_rl.training.metrics import read_metrics
@@ -150,3 +156,84 @@ def test_no_steps_leave_the_model_as_it_is(tmp_path):
     fresh = GenerativeReward.for_vectors(3, SPECS["box"], hidden=[16], seed=0)
     assert same(weights, dict(GenerativeRewardLoss(fresh).named_parameters()))
     assert rows == []
+
+
+# Models of pixels, which normalise by batch
+
+
+def pixel_loss():
+    return CuriosityRewardLoss(CuriosityReward.for_pixels(SPECS["discrete"], seed=0))
+
+
+def frames(n, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    s, following = torch.randint(256, (2, n, 4, 84, 84), generator=generator, dtype=torch.uint8)
+    action = torch.randint(3, (n,), generator=generator)
+    return TensorDict({"observation": s, "action": action, "next": {"observation": following}}, [n])
+
+
+def fit_frames(folder, *, loss=None, held_out=None, **kwargs):
+    """Fits a new model to 8 transitions; all that it holds, and the rows of the log."""
+    cfg = FitConfig(**{"steps": 6, "batch": 4, "lr": 1e-3, "log_every": 2, **kwargs})
+    loss = pixel_loss() if loss is None else loss
+    with Run.open(folder, {}, recipe="x") as run:
+        fit.fit_reward(loss, frames(8), cfg, seed=0, run=run, held_out=held_out)
+    return dict(loss.state_dict()), read_metrics(folder / "metrics.jsonl")
+
+
+def test_batch_normalisation_learns_in_steps_and_nowhere_else(tmp_path):
+    loss, modes = pixel_loss(), []
+    (first, *_) = [part for part in loss.modules() if isinstance(part, nn.BatchNorm2d)]
+    first.register_forward_pre_hook(lambda part, inputs: modes.append(part.training))
+    state, _ = fit_frames(tmp_path / "both", loss=loss, held_out=frames(3, seed=1))
+    # For s and s', two steps of training and then the two sets that are logged.
+    assert modes == 3 * (2 * [True, True] + 2 * [False, False])
+    assert not any(part.training for part in loss.modules())
+    assert first.num_batches_tracked == 2 * 6
+    alone, _ = fit_frames(tmp_path / "alone", log_every=6)
+    assert all(torch.equal(value, alone[name]) for name, value in state.items())
+
+
+def test_a_finished_or_empty_fit_leaves_the_model_in_eval_mode(tmp_path):
+    fit_frames(tmp_path / "run", steps=2)
+    for folder, steps in (("run", 2), ("empty", 0)):
+        loss = pixel_loss().train()
+        fit_frames(tmp_path / folder, loss=loss, steps=steps)
+        assert not any(part.training for part in loss.modules())
+
+
+def test_the_logged_loss_of_frames_is_that_of_eval_mode(tmp_path):
+    loss = pixel_loss()
+    _, found = fit_frames(tmp_path, loss=loss)
+    with torch.no_grad():
+        evaluated = loss.eval()(frames(8))
+        normalised_by_the_batch = loss.train()(frames(8))
+    for term in ("inverse", "forward"):
+        logged = found[-1][f"fit/fitted/{term}"]
+        assert logged == pytest.approx(evaluated[f"loss_{term}"].item(), rel=1e-5)
+        assert logged != pytest.approx(normalised_by_the_batch[f"loss_{term}"].item(), rel=1e-2)
+
+
+def test_a_fit_of_frames_is_resumed_bit_for_bit_with_its_statistics(tmp_path, monkeypatch):
+    monkeypatch.setattr(fit, "CHECKPOINT_EVERY", 4)
+    expected, expected_rows = fit_frames(tmp_path / "whole")
+    log = Run.log
+    for step, how in ((2, Interrupted), (6, Killed)):
+        with monkeypatch.context() as patch, pytest.raises(how):
+
+            def log_and_stop(self, at, values, *, phase, step=step, how=how):
+                log(self, at, values, phase=phase)
+                if at == step:
+                    if how is Killed:
+                        raise Killed
+                    signal.raise_signal(signal.SIGINT)
+
+            patch.setattr(Run, "log", log_and_stop)
+            fit_frames(tmp_path / "run")
+        torch.manual_seed(99)
+    found, found_rows = fit_frames(tmp_path / "run")
+    assert found.keys() == expected.keys()
+    assert any(name.endswith("running_var") for name in found)
+    for name, value in expected.items():
+        assert torch.equal(found[name], value), name
+    assert found_rows == expected_rows
