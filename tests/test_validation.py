@@ -4,6 +4,8 @@ from dataclasses import dataclass, field
 import pytest
 
 from giril_rl.configs import (
+    AdversarialConfig,
+    CuriosityConfig,
     DemoConfig,
     ExpertConfig,
     ExpertRunConfig,
@@ -148,6 +150,84 @@ def test_the_horizon(key, value, sentence):
     assert str(refusal.value) == sentence
     config.task.horizon, config.task.after_failure = "fixed", "continue"
     validate(config)
+
+
+@dataclass
+class Control(RunConfig):
+    giril: GenerativeConfig = field(default_factory=GenerativeConfig)
+    icm: CuriosityConfig = field(default_factory=CuriosityConfig)
+
+
+@dataclass
+class Curious(RunConfig):
+    reward: CuriosityConfig = field(default_factory=CuriosityConfig)
+
+
+@dataclass
+class Adversarial(RunConfig):
+    reward: AdversarialConfig = field(default_factory=AdversarialConfig)
+
+
+@pytest.mark.parametrize(
+    ("env_id", "rule", "right"),
+    [
+        ("Reach-v0", "pixels", "standardise"),
+        ("ALE/Pong-v5", "standardise", "pixels"),
+        ("ALE/Pong-v5", "raw", "pixels"),
+    ],
+)
+@pytest.mark.parametrize("kind", [Config, Curious, Adversarial])
+def test_frames_and_vectors_are_not_normalised_alike(kind, env_id, rule, right):
+    config = kind(task=TaskConfig(name="reach", env_id=env_id), steps=10_000)
+    config.reward.normalise = rule
+    with pytest.raises(UserError) as refusal:
+        validate(config)
+    assert str(refusal.value) == (
+        f"reward.normalise={rule} does not fit the observations of reach: "
+        f"set reward.normalise={right}."
+    )
+    config.reward.normalise = right
+    validate(config)
+
+
+@pytest.mark.parametrize("part", ["giril", "icm"])
+def test_the_controls_models_are_held_to_the_same(part):
+    config = Control(task=TaskConfig(name="pong", env_id="ALE/Pong-v5"), steps=10_000)
+    config.giril.normalise = config.icm.normalise = "pixels"
+    validate(config)
+    getattr(config, part).normalise = "demo_range"
+    with pytest.raises(UserError, match=rf"^{part}\.normalise=demo_range .*=pixels\.$"):
+        validate(config)
+
+
+@pytest.mark.parametrize("after_failure", ["reset", "continue"])
+def test_games_have_no_fixed_horizon(after_failure):
+    config = good()
+    config.task = TaskConfig(
+        name="pong", env_id="ALE/Pong-v5", horizon="fixed", after_failure=after_failure
+    )
+    config.reward.normalise = "pixels"
+    with pytest.raises(UserError) as refusal:
+        validate(config)
+    assert str(refusal.value) == "task.horizon=fixed is for vector tasks: leave task.horizon=own."
+    config.task = TaskConfig(name="pong", env_id="ALE/Pong-v5")
+    validate(config)
+
+
+@pytest.mark.parametrize(("steps", "fits"), [(2048, True), (2000, False)])
+def test_steps_of_atari_s_expert_are_its_own_batches(steps, fits):
+    """8 games and 128 steps, whatever the recipe's own PPO has."""
+
+    @dataclass
+    class WithExpert(RunConfig):
+        expert: ExpertConfig = field(default_factory=lambda: ExpertConfig(steps=steps))
+
+    config = WithExpert(task=TaskConfig(name="pong", env_id="ALE/Pong-v5"), steps=10_000)
+    if fits:
+        validate(config)
+    else:
+        with pytest.raises(UserError, match=r"^expert\.steps=2000 .* give 1024 or 2048\.$"):
+            validate(config)
 
 
 def test_an_expert_plays_the_task_as_it_is():
