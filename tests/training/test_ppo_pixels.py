@@ -139,8 +139,6 @@ def test_the_value_loss_is_clipped_where_asked(agent, clip_value):
 
 # Whole trainings
 
-pytest.importorskip("ale_py")
-
 BATCH = 2 * 16
 
 
@@ -160,6 +158,7 @@ def rows(folder):
 
 def train(folder, *, steps=4 * BATCH, env=AtariEnv, relabel=learned_reward, seed=0, **kwargs):
     """Trains in ``folder`` with objects of its own; all that the last checkpoint holds."""
+    pytest.importorskip("ale_py")
     env = env("breakout", 2, **kwargs)
     agent, cfg = make_agent(env, config(), seed=0), config()
     with Run.open(folder, {}, recipe="x") as run:
