@@ -150,18 +150,19 @@ def discriminator_reward(
     form = cast(RewardForm, cfg.form)
     frames, size = _observation(env)
     if frames:
-        return DiscriminatorReward.for_pixels(
+        reward = DiscriminatorReward.for_pixels(
             env.action_spec, channels=frames, form=form, seed=seed
         )
-    reward = DiscriminatorReward.for_vectors(
-        size,
-        env.action_spec,
-        hidden=cfg.hidden,
-        form=form,
-        normalise=cast(DiscriminatorScaling, cfg.normalise),
-        clamp=cfg.clamp,
-        seed=seed,
-    )
+    else:
+        reward = DiscriminatorReward.for_vectors(
+            size,
+            env.action_spec,
+            hidden=cfg.hidden,
+            form=form,
+            normalise=cast(DiscriminatorScaling, cfg.normalise),
+            clamp=cfg.clamp,
+            seed=seed,
+        )
     reward.fit_scaler(demo.transitions["observation"])
     return reward
 
@@ -180,19 +181,20 @@ def bottleneck_reward(
     form = cast(RewardForm, cfg.form)
     frames, size = _observation(env)
     if frames:
-        return BottleneckReward.for_pixels(
+        reward = BottleneckReward.for_pixels(
             env.action_spec, channels=frames, form=form, latent=cfg.latent, seed=seed
         )
-    reward = BottleneckReward.for_vectors(
-        size,
-        env.action_spec,
-        hidden=cfg.hidden,
-        form=form,
-        normalise=cast(DiscriminatorScaling, cfg.normalise),
-        clamp=cfg.clamp,
-        latent=cfg.latent,
-        seed=seed,
-    )
+    else:
+        reward = BottleneckReward.for_vectors(
+            size,
+            env.action_spec,
+            hidden=cfg.hidden,
+            form=form,
+            normalise=cast(DiscriminatorScaling, cfg.normalise),
+            clamp=cfg.clamp,
+            latent=cfg.latent,
+            seed=seed,
+        )
     reward.fit_scaler(demo.transitions["observation"])
     return reward
 
