@@ -74,7 +74,7 @@ def test_each_recipe_leaves_a_whole_result(recipe, expert, root, tmp_path):
     assert demo.transitions["observation"].dtype == torch.uint8
     assert demo.transitions["next", "done"].sum() == 1  # One life.
     # Frames all the way: the policy's first layer looks at four of them.
-    policy = load_state(tmp_path / "policy.safetensors")
+    policy = load_state(tmp_path / "policy" / "model.safetensors")
     assert policy["actor.trunk.0.weight"].shape == (32, 4, 8, 8)
     rows = read_metrics(tmp_path / "metrics.jsonl")
     numbers = [value for row in rows for key, value in row.items() if key != "phase"]
