@@ -246,6 +246,26 @@ class GenerativeReward(Pretrained, TensorDictModuleBase):
         """The predicted next observation, scaled but not clamped, for a scaled observation."""
         return self.decoder(action_code, observation)
 
+    def predict(self, observation: Tensor, action: Tensor, following: Tensor) -> Tensor:
+        """What the reward compares with s': the predicted next observation, scaled and clamped.
+
+        It is clamped only where the scaler clamps. With ``beta<1`` it depends on s' and on noise,
+        which is drawn as for the reward.
+
+        Args:
+            observation: s, as the environment shows it.
+            action: the action.
+            following: s', as the environment shows it.
+
+        Examples:
+            >>> from torchrl.data import Categorical
+            >>> reward = GenerativeReward.for_pixels(Categorical(3))
+            >>> black = torch.zeros(2, 4, 84, 84, dtype=torch.uint8)
+            >>> reward.predict(black, torch.tensor([0, 2]), black).shape
+            torch.Size([2, 4, 84, 84])
+        """
+        return self._predict(self.scaler(observation), action, self.scaler(following))
+
     def prior(self, observation: Tensor) -> tuple[Tensor | None, Tensor | None]:
         """Mean and log-variance of ``p(z | s)`` for a scaled observation; None, None if N(0, I)."""
         if self.prior_network is None:
@@ -270,13 +290,15 @@ class GenerativeReward(Pretrained, TensorDictModuleBase):
 
     def _error(self, observation: Tensor, action: Tensor, following: Tensor) -> Tensor:
         observation, following = self.scaler(observation), self.scaler(following)
+        predicted = self._predict(observation, action, following)
+        return reconstruction_error(predicted, following, self.scaler.event_dims)
+
+    def _predict(self, observation: Tensor, action: Tensor, following: Tensor) -> Tensor:
         code = self.actions(action)
         if self.beta < 1:
             code = blend_action(code, self._encoded_action(observation, following), self.beta)
         predicted = self.decode(code, observation)
-        if self.scaler.clamp:
-            predicted = predicted.clamp(-1.0, 1.0)
-        return reconstruction_error(predicted, following, self.scaler.event_dims)
+        return predicted.clamp(-1.0, 1.0) if self.scaler.clamp else predicted
 
     def _is_factored(self, observation: Tensor) -> bool:
         """Whether the decoder's two parts can be computed apart: exact, but without gradient."""

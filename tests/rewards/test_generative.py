@@ -73,6 +73,19 @@ def test_equation_2_by_hand():
     assert reward(batch)["next", "intrinsic_reward"].tolist() == [[6.5], [0.5]]
 
 
+@pytest.mark.parametrize(("beta", "clamp"), [(1.0, True), (0.5, False)])
+def test_the_prediction_is_what_the_reward_compares(beta, clamp):
+    reward = make(beta=beta, normalise="standardise", clamp=clamp)
+    data = transitions(6)
+    reward.scaler.fit(3 * data["observation"] + 1)
+    parts = data["observation"], data["action"], data["next", "observation"]
+    state = reward.get_extra_state()
+    predicted = reward.predict(*parts)
+    reward.set_extra_state(state)
+    error = reconstruction_error(predicted, reward.scaler(parts[2]))
+    assert torch.equal(reward(data)["next", "intrinsic_reward"].squeeze(-1), error)
+
+
 def test_prediction_is_clamped_with_the_states():
     reward = GenerativeReward(
         Fixed(lambda x: x),
