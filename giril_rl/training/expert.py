@@ -87,7 +87,15 @@ def obtain_expert(cfg: RunConfig, expert: ExpertConfig) -> tuple[Path, dict[str,
                 "choose an expert of the same task."
             )
         return folder, result
-    settings = apply_task_defaults(
+    settings = expert_settings(cfg, expert)
+    folder = out_folder("expert", settings, {})
+    with made_once(folder, "expert"):
+        return folder, train_expert(settings, folder)
+
+
+def expert_settings(cfg: RunConfig, expert: ExpertConfig) -> ExpertRunConfig:
+    """The settings of the expert that a recipe asks for, unless it is given by its path."""
+    return apply_task_defaults(
         ExpertRunConfig(
             task=with_own_episodes(cfg.task),
             root=cfg.root,
@@ -99,9 +107,6 @@ def obtain_expert(cfg: RunConfig, expert: ExpertConfig) -> tuple[Path, dict[str,
             stop_early=expert.stop_early,
         )
     )
-    folder = out_folder("expert", settings, {})
-    with made_once(folder, "expert"):
-        return folder, train_expert(settings, folder)
 
 
 def check_task(cfg: RunConfig) -> None:
@@ -153,8 +158,7 @@ def obtain_demonstration(
         return _given_demonstration(cfg.task, demo.path), None
     source, result = obtain_expert(cfg, expert)
     task = _recorded_task(cfg.task, demo)
-    identity = _identity(task, demo, result["config_hash"])
-    folder = Path(cfg.root) / "demos" / safe(task.name) / identity
+    folder = Path(cfg.root) / demonstration_place(cfg.task, demo, result["config_hash"])
     with made_once(folder, "demonstration"):
         if not folder.exists():
             agent = load_agent(source, cfg.task)
@@ -171,6 +175,22 @@ def obtain_demonstration(
             )
             recorded.save(folder)
     return Demonstration.load(folder), result
+
+
+def demonstration_place(task: TaskConfig, demo: DemoConfig, expert: str) -> Path:
+    """Where a recorded demonstration lies below the root of runs.
+
+    Args:
+        task: the recipe's task.
+        demo: what is recorded.
+        expert: the expert's ``config_hash``.
+
+    Examples:
+        >>> pong = TaskConfig(name="pong", env_id="ALE/Pong-v5")
+        >>> demonstration_place(pong, DemoConfig(), "0123456789ab").parent.as_posix()
+        'demos/pong'
+    """
+    return Path("demos") / safe(task.name) / _identity(_recorded_task(task, demo), demo, expert)
 
 
 def _recorded_task(task: TaskConfig, demo: DemoConfig) -> TaskConfig:

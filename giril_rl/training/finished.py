@@ -38,15 +38,41 @@ def read_settings(folder: Path) -> tuple[TaskConfig, EvalConfig]:
     Raises:
         UserError: if the file is missing or is not what a run writes.
     """
-    path = folder / "config.yaml"
+    config = read_config(folder)
+    return (
+        read_part(folder, config, "task", TaskConfig),
+        read_part(folder, config, "eval", EvalConfig),
+    )
+
+
+def read_config(folder: Path) -> dict[str, Any]:
+    """What a run's ``config.yaml`` holds, nested.
+
+    Raises:
+        UserError: if the file is missing or is not what a run writes.
+    """
     try:
-        config = yaml.safe_load(path.read_text(encoding="utf-8"))
-        return (
-            _part(TaskConfig, config["task"]),
-            _part(EvalConfig, config["eval"]),
-        )
-    except (OSError, ValueError, KeyError, TypeError, yaml.YAMLError):
-        raise UserError(f"{folder} is not a run's folder (no readable config.yaml).") from None
+        config = yaml.safe_load((folder / "config.yaml").read_text(encoding="utf-8"))
+    except (OSError, ValueError, yaml.YAMLError):
+        raise _no_run(folder) from None
+    if not isinstance(config, dict):
+        raise _no_run(folder)
+    return config
+
+
+def read_part(folder: Path, config: dict[str, Any], name: str, kind: type[Part]) -> Part:
+    """One part of :func:`read_config`'s settings as the dataclass that it was made of.
+
+    Keys that the dataclass does not have are passed over.
+
+    Raises:
+        UserError: if there is no such part.
+    """
+    names = {f.name for f in fields(kind)}  # type: ignore[arg-type]
+    try:
+        return kind(**{key: value for key, value in config[name].items() if key in names})
+    except (KeyError, TypeError, AttributeError):
+        raise _no_run(folder) from None
 
 
 def evaluate_run(folder: Path, episodes: int | None = None, seed: int | None = None) -> None:
@@ -109,6 +135,5 @@ def describe(kind: str, scores: dict[str, Any]) -> str:
     )
 
 
-def _part(kind: type[Part], values: dict[str, Any]) -> Part:
-    names = {f.name for f in fields(kind)}  # type: ignore[arg-type]
-    return kind(**{key: value for key, value in values.items() if key in names})
+def _no_run(folder: Path) -> UserError:
+    return UserError(f"{folder} is not a run's folder (no readable config.yaml).")

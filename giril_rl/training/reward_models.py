@@ -30,14 +30,15 @@ from giril_rl.rewards import (
 
 
 def generative_reward(
-    cfg: GenerativeConfig, env: BatchedEnv, demo: Demonstration, *, seed: int
+    cfg: GenerativeConfig, env: BatchedEnv, demo: Demonstration | None, *, seed: int
 ) -> GenerativeReward:
     """GIRIL's reward module, to be fitted.
 
     Args:
         cfg: its settings, of which ``alpha`` is the loss's and ``seed`` the caller's to resolve.
         env: the environment, for its specs.
-        demo: the demonstration, all of whose observations the scaler is fitted to.
+        demo: the demonstration, all of whose observations the scaler is fitted to; None where
+            saved weights follow, the scaler's among them.
         seed: seed of weights and noise. The global random state is neither read nor changed.
 
     Examples:
@@ -74,7 +75,8 @@ def generative_reward(
             clamp=cfg.clamp,
             seed=seed,
         )
-    reward.scaler.fit(demo.transitions["observation"])
+    if demo is not None:
+        reward.scaler.fit(demo.transitions["observation"])
     return reward
 
 
