@@ -11,6 +11,7 @@ from giril_rl.report.bars import draw_bars
 from giril_rl.report.curves import draw_results, draw_varied
 from giril_rl.report.formats import budget_text, markdown, seeds_text, steps_text, to_csv
 from giril_rl.report.overall import overall
+from giril_rl.report.pictures import draw_pictures
 from giril_rl.report.rows import Panel, panels_of
 from giril_rl.report.runs import RunRecord, Unfinished, read_runs
 from giril_rl.report.statistics import RESAMPLES, load_rliable
@@ -59,6 +60,7 @@ def write_report(folder: Path, out: Path) -> str:
         )
         sections.append(overall(panels))
     sections += [_section(table, out) for table in tables]
+    sections += draw_pictures(panels, out)
     sections += [_leftovers(panels), _without_result(unfinished)]
     write_atomically(out / "report.md", "\n".join(text for text in sections if text))
     write_atomically(out / "results.csv", to_csv(tables))

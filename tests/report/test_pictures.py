@@ -1,0 +1,117 @@
+"""The command on a made-up Atari run: its pictures, and what it says where something is missing."""
+
+import re
+import shutil
+import sys
+
+import pytest
+
+from giril_rl.cli import main
+from giril_rl.configs import DemoConfig, ExpertConfig, RunConfig
+from giril_rl.demos import record_demonstration
+from giril_rl.envs import gym_factory, make_env
+from giril_rl.naming import config_hash
+from giril_rl.rewards import GenerativeRewardLoss
+from giril_rl.training import fitted, generative_reward, make_agent, save_agent
+from giril_rl.training.checkpoint import save_state
+from giril_rl.training.expert import demonstration_place, expert_settings
+from giril_rl.training.finished import read_config, read_part, read_settings
+
+WORDS = ("task=breakout", "task.max_episode_steps=20")
+
+
+@pytest.fixture
+def run(made):
+    """``run(recipe, *words)``: the folder of a run with policy and reward model."""
+    pytest.importorskip("ale_py")
+
+    def write(recipe, *words):
+        folder = made(recipe, *WORDS, *words, score=1.0, demo_transitions=9)
+        config = read_config(folder)
+        task, ppo, _ = read_settings(folder)
+        env = make_env(task, 1, seed=0)
+        save_agent(make_agent(env, ppo, seed=0), folder)
+        section = "giril" if recipe == "control" else "reward"
+        settings = read_part(folder, config, section, fitted.GenerativeConfig)
+        loss = GenerativeRewardLoss(generative_reward(settings, env, None, seed=0))
+        save_state(folder / "fit.safetensors", {"loss": dict(loss.state_dict())})
+        return folder
+
+    return write
+
+
+def record(root, folder):
+    """Records what the run in ``folder`` asks for, where recipes do."""
+    config = read_config(folder)
+    task, _, _ = read_settings(folder)
+    demo, expert = (
+        read_part(folder, config, name, kind)
+        for name, kind in (("demo", DemoConfig), ("expert", ExpertConfig))
+    )
+    made_by = config_hash(expert_settings(RunConfig(task=task), expert))
+    recorded = record_demonstration(
+        gym_factory(task), lambda seen: seen.new_zeros(1).long(), seed=0, length=9, lives="first"
+    )
+    recorded.save(root / demonstration_place(task, demo, made_by))
+
+
+def report(made, capsys):
+    out = made.root.parent / "out"
+    shutil.rmtree(out, ignore_errors=True)
+    assert main(["report", str(made.root), "--out", str(out)]) == 0
+    capsys.readouterr()
+    pictures = {path.name: path.read_bytes() for path in out.glob("*.png")}
+    section = (out / "report.md").read_text().partition(": pictures\n")[2]
+    return section, {k: v for k, v in pictures.items() if k.startswith(("predictions", "reward"))}
+
+
+def test_the_lowest_seed_of_a_row_has_two_pictures(run, made, capsys):
+    record(made.root, run("giril", "seed=1"))
+    run("giril", "seed=2")
+    made("cdil", *WORDS, score=1.0)
+    section, pictures = report(made, capsys)
+    name = "breakout-task.max_episode_steps=20-giril-released-49999872-seed1.png"
+    assert sorted(pictures) == [f"predictions-{name}", f"reward-{name}"]
+    assert re.findall(r"\]\((.*?)\)", section) == sorted(pictures)
+    assert all(content.startswith(b"\x89PNG") for content in pictures.values())
+    about = r"^GIRIL \(released\), seed 1, 49,999,872 steps: `giril/breakout/task=.*,seed=1`; "
+    assert re.search(about + r"a whole game of \d+ steps, seed 10000\.$", section, re.M)
+    assert "not there any more" not in section
+    assert report(made, capsys) == (section, pictures)
+
+
+def test_without_its_demonstration_a_run_shows_its_policy(run, made, capsys):
+    run("giril", "reward.beta=0.9")
+    section, pictures = report(made, capsys)
+    assert len(pictures) == 2
+    assert (
+        "Its demonstration is not there any more, so all transitions are the policy's." in section
+    )
+    assert not (made.root / "demos").exists() and not (made.root / "expert").exists()
+
+
+def test_what_is_missing_is_said_in_one_sentence(run, made, capsys, monkeypatch):
+    (run("giril", "reward.beta=0.7") / "fit.safetensors").unlink()
+    (run("giril", "reward.beta=0.8") / "policy.safetensors").unlink()
+    made("giril", *WORDS, "reward.beta=0.9", score=1.0)
+    text, pictures = report(made, capsys)
+    place = f"giril/breakout/{','.join(WORDS)},reward.beta="
+    assert not pictures
+    assert text.strip().splitlines() == [
+        f"No pictures of `{place}0.7`: its fit.safetensors does not exist, which has the reward "
+        "model's weights.",
+        "",
+        f"No pictures of `{place}0.8`, `{place}0.9`: its policy.safetensors does not exist, which "
+        "has the policy's weights.",
+    ]
+    monkeypatch.setitem(sys.modules, "ale_py", None)
+    text, _ = report(made, capsys)
+    (line,) = [line for line in text.splitlines() if "0.7" in line]
+    reason = 'this task needs ale_py, which is not installed: pip install "giril-rl[atari]".'
+    assert line == f"No pictures of `{place}0.7`: {reason}"
+
+
+def test_vectors_have_no_pictures(made, capsys):
+    made("giril", score=1.0)
+    section, pictures = report(made, capsys)
+    assert not section and not pictures
