@@ -70,4 +70,14 @@ def main(cfg: Config, out: Path) -> None:
             run=run,
             termination=cfg.termination,
         )
-        finish_run(run, cfg, agent, trained, method=method, expert=expert, demo=demo, seeds=seeds)
+        finish_run(
+            run,
+            cfg,
+            agent,
+            trained,
+            method=method,
+            expert=expert,
+            demo=demo,
+            reward=reward,
+            seeds=seeds,
+        )

@@ -6,8 +6,6 @@ from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
 
-from tensordict.nn import TensorDictModuleBase
-
 from giril_rl.configs import DemoConfig, is_atari
 from giril_rl.demos import Demonstration
 from giril_rl.errors import UserError
@@ -18,10 +16,14 @@ from giril_rl.report.predictions import Shown, draw_predictions, foresee, spread
 from giril_rl.report.rows import Panel, Row
 from giril_rl.report.runs import RunRecord
 from giril_rl.rewards import GenerativeReward
-from giril_rl.training.agent import POLICY_FILE, load_agent
+from giril_rl.training.agent import load_agent
 from giril_rl.training.finished import read_config, read_part, read_settings
-from giril_rl.training.fitted import GENERATIVE, UNTRAINED, find_demonstration, load_reward
+from giril_rl.training.fitted import find_demonstration
+from giril_rl.training.result import REWARD
 
+UNTRAINED = "control:untrained_giril"
+GENERATIVE = frozenset({"giril", UNTRAINED})
+"""Methods, as results name them, whose reward is a generative model's error."""
 EACH = 4
 """Transitions of the demonstration, and of the policy."""
 MOST_STEPS_LITERAL = 300
@@ -82,13 +84,11 @@ _EXPLAINED = (
 
 def _pictures(panel: Panel, row: Row, run: RunRecord, out: Path) -> str:
     """Draws a run's two pictures; their Markdown."""
-    if not (run.folder / POLICY_FILE).exists():
-        raise UserError(f"its {POLICY_FILE} does not exist, which has the policy's weights.")
-    task, ppo, scoring = read_settings(run.folder)
-    model, reward = load_reward(run.folder)
+    task, scoring = read_settings(run.folder)
+    model = GenerativeReward.from_pretrained(run.folder / REWARD)
     demo = find_demonstration(run.folder)
     most = MOST_STEPS if model.beta == 1 else MOST_STEPS_LITERAL
-    agent = load_agent(run.folder, task, ppo)
+    agent = load_agent(run.folder, task)
     game = play_game(agent, task, seed=scoring.seed, most=most)
     length = f"{len(game.lives):,} steps"
     played = f"a whole game of {length}" if game.whole else f"the first {length} of a game"
@@ -96,7 +96,6 @@ def _pictures(panel: Panel, row: Row, run: RunRecord, out: Path) -> str:
     indices = spread(len(game.lives), EACH)
     policy = foresee(
         model,
-        reward,
         game.transitions[indices],
         title=f"trained policy, {played}",
         labels=[f"step {index + 1:,}" for index in indices],
@@ -104,13 +103,13 @@ def _pictures(panel: Panel, row: Row, run: RunRecord, out: Path) -> str:
     )
     groups, usual = [policy], None
     if demo is not None:
-        groups.insert(0, _foresee_demonstration(run, demo, model, reward, game.actions))
-        usual = rewards_of(reward, demo.transitions[spread(len(demo), most)]).mean().item()
+        groups.insert(0, _foresee_demonstration(run, demo, model, game.actions))
+        usual = rewards_of(model, demo.transitions[spread(len(demo), most)]).mean().item()
     name = safe("-".join(filter(None, (*_names(panel, row), f"{run.steps}", f"seed{run.seed}"))))
     about = f"{row.name}, seed {run.seed}, {run.steps:,} steps"
     title = f"{panel.title}: {about}"
     draw_predictions(groups, title, out / f"predictions-{name}.png")
-    draw_game(rewards_of(reward, game.transitions), game, title, out / f"reward-{name}.png", usual)
+    draw_game(rewards_of(model, game.transitions), game, title, out / f"reward-{name}.png", usual)
     settings = f" `{row.settings}`" if row.settings else ""
     without = "" if demo is not None else f" {_NO_DEMONSTRATION}"
     return (
@@ -132,7 +131,6 @@ def _foresee_demonstration(
     run: RunRecord,
     demo: Demonstration,
     model: GenerativeReward,
-    reward: TensorDictModuleBase,
     actions: Sequence[str],
 ) -> Shown:
     indices = spread(len(demo), EACH)
@@ -149,4 +147,4 @@ def _foresee_demonstration(
             f"{label}\n{'not ' if index % every else ''}fitted"
             for index, label in zip(indices, labels, strict=True)
         ]
-    return foresee(model, reward, some, title=title, labels=labels, actions=actions)
+    return foresee(model, some, title=title, labels=labels, actions=actions)

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
 
 from giril_rl.report.drawing import new_figure, save
 from giril_rl.rewards import GenerativeReward
@@ -63,7 +62,6 @@ def spread(length: int, count: int) -> list[int]:
 @torch.no_grad()
 def foresee(
     model: GenerativeReward,
-    reward: TensorDictModuleBase,
     transitions: TensorDictBase,
     *,
     title: str,
@@ -74,7 +72,6 @@ def foresee(
 
     Args:
         model: the generative model of frames, in eval mode.
-        reward: the reward made of it.
         transitions: ``observation``, ``action`` and ``("next", "observation")``, batch [n].
         title: where the transitions come from.
         labels: a few words for each.
@@ -85,7 +82,7 @@ def foresee(
     noise = model.get_extra_state()
     predicted = model.predict(before, chosen, after)
     model.set_extra_state(noise)  # For beta < 1, the reward is of this very prediction.
-    values = reward(transitions.select(*keys)).get(reward.out_keys[0])
+    values = model(transitions.select(*keys)).get(model.out_keys[0])
     return Shown(
         title=title,
         labels=list(labels),

@@ -5,6 +5,8 @@ from __future__ import annotations
 from datetime import UTC, datetime
 from typing import Any
 
+from torch import nn
+
 from giril_rl.configs import RunConfig
 from giril_rl.demos import Demonstration
 from giril_rl.naming import config_hash
@@ -47,7 +49,7 @@ def finish_run(
     expert: dict[str, Any] | None = None,
     demo: Demonstration | None = None,
     seeds: dict[str, int] | None = None,
-    reward: Pretrained | None = None,
+    reward: nn.Module | None = None,
 ) -> dict[str, Any]:
     """Scores the policy on fresh environments and writes policy, curve and ``result.json``.
 
@@ -60,7 +62,7 @@ def finish_run(
         expert: the expert's result, if there was one.
         demo: the demonstration, if there was one.
         seeds: seeds besides those of policy and evaluation.
-        reward: the trained reward module, if there is one, to be kept beside the policy.
+        reward: the reward module, if there is one; kept beside the policy if it can be.
 
     Returns:
         What ``result.json`` holds.
@@ -88,7 +90,7 @@ def finish_run(
     card = {key: result[key] for key in CARD_KEYS}
     if not isinstance(agent, RandomPolicy):
         agent.save_pretrained(run.folder / POLICY, card)
-    if reward is not None:
+    if isinstance(reward, Pretrained):
         reward.save_pretrained(run.folder / REWARD, card)
     rows = read_metrics(run.folder / "metrics.jsonl")
     names: dict[str, Any] = {"recipe": method, "task": cfg.task.name, "seed": cfg.seed}

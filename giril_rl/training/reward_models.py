@@ -30,15 +30,14 @@ from giril_rl.rewards import (
 
 
 def generative_reward(
-    cfg: GenerativeConfig, env: BatchedEnv, demo: Demonstration | None, *, seed: int
+    cfg: GenerativeConfig, env: BatchedEnv, demo: Demonstration, *, seed: int
 ) -> GenerativeReward:
     """GIRIL's reward module, to be fitted.
 
     Args:
         cfg: its settings, of which ``alpha`` is the loss's and ``seed`` the caller's to resolve.
         env: the environment, for its specs.
-        demo: the demonstration, all of whose observations the scaler is fitted to; None where
-            saved weights follow, the scaler's among them.
+        demo: the demonstration, all of whose observations the scaler is fitted to.
         seed: seed of weights and noise. The global random state is neither read nor changed.
 
     Examples:
@@ -75,8 +74,7 @@ def generative_reward(
             clamp=cfg.clamp,
             seed=seed,
         )
-    if demo is not None:
-        reward.scaler.fit(demo.transitions["observation"])
+    reward.scaler.fit(demo.transitions["observation"])
     return reward
 
 

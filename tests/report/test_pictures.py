@@ -7,13 +7,12 @@ import sys
 import pytest
 
 from giril_rl.cli import main
-from giril_rl.configs import DemoConfig, ExpertConfig, RunConfig
+from giril_rl.configs import DemoConfig, ExpertConfig, GenerativeConfig, PPOConfig, RunConfig
 from giril_rl.demos import record_demonstration
 from giril_rl.envs import gym_factory, make_env
 from giril_rl.naming import config_hash
-from giril_rl.rewards import GenerativeRewardLoss
-from giril_rl.training import fitted, generative_reward, make_agent, save_agent
-from giril_rl.training.checkpoint import save_state
+from giril_rl.rewards import GenerativeReward
+from giril_rl.training import make_agent
 from giril_rl.training.expert import demonstration_place, expert_settings
 from giril_rl.training.finished import read_config, read_part, read_settings
 
@@ -28,13 +27,11 @@ def run(made):
     def write(recipe, *words):
         folder = made(recipe, *WORDS, *words, score=1.0, demo_transitions=9)
         config = read_config(folder)
-        task, ppo, _ = read_settings(folder)
-        env = make_env(task, 1, seed=0)
-        save_agent(make_agent(env, ppo, seed=0), folder)
-        section = "giril" if recipe == "control" else "reward"
-        settings = read_part(folder, config, section, fitted.GenerativeConfig)
-        loss = GenerativeRewardLoss(generative_reward(settings, env, None, seed=0))
-        save_state(folder / "fit.safetensors", {"loss": dict(loss.state_dict())})
+        env = make_env(read_settings(folder)[0], 1, seed=0)
+        make_agent(env, PPOConfig(), seed=0).save_pretrained(folder / "policy")
+        beta = read_part(folder, config, "reward", GenerativeConfig).beta
+        reward = GenerativeReward.for_pixels(env.action_spec, beta=beta)
+        reward.save_pretrained(folder / "reward")
         return folder
 
     return write
@@ -43,7 +40,7 @@ def run(made):
 def record(root, folder):
     """Records what the run in ``folder`` asks for, where recipes do."""
     config = read_config(folder)
-    task, _, _ = read_settings(folder)
+    task, _ = read_settings(folder)
     demo, expert = (
         read_part(folder, config, name, kind)
         for name, kind in (("demo", DemoConfig), ("expert", ExpertConfig))
@@ -91,24 +88,23 @@ def test_without_its_demonstration_a_run_shows_its_policy(run, made, capsys):
 
 
 def test_what_is_missing_is_said_in_one_sentence(run, made, capsys, monkeypatch):
-    (run("giril", "reward.beta=0.7") / "fit.safetensors").unlink()
-    (run("giril", "reward.beta=0.8") / "policy.safetensors").unlink()
-    made("giril", *WORDS, "reward.beta=0.9", score=1.0)
+    shutil.rmtree(run("giril", "reward.beta=0.7") / "reward")
+    shutil.rmtree(run("giril", "reward.beta=0.8") / "policy")
     text, pictures = report(made, capsys)
     place = f"giril/breakout/{','.join(WORDS)},reward.beta="
     assert not pictures
     assert text.strip().splitlines() == [
-        f"No pictures of `{place}0.7`: its fit.safetensors does not exist, which has the reward "
-        "model's weights.",
+        f"No pictures of `{place}0.7`: its reward holds no saved module (card.json and "
+        "model.safetensors): check the path.",
         "",
-        f"No pictures of `{place}0.8`, `{place}0.9`: its policy.safetensors does not exist, which "
-        "has the policy's weights.",
+        f"No pictures of `{place}0.8`: it holds no trained policy: run it to its end first.",
     ]
+    run("giril", "reward.beta=0.9")
     monkeypatch.setitem(sys.modules, "ale_py", None)
     text, _ = report(made, capsys)
-    (line,) = [line for line in text.splitlines() if "0.7" in line]
+    (line,) = [line for line in text.splitlines() if "0.9" in line]
     reason = 'this task needs ale_py, which is not installed: pip install "giril-rl[atari]".'
-    assert line == f"No pictures of `{place}0.7`: {reason}"
+    assert line == f"No pictures of `{place}0.9`: {reason}"
 
 
 def test_vectors_have_no_pictures(made, capsys):

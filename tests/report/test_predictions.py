@@ -7,14 +7,13 @@ from tensordict import TensorDict
 from torchrl.data import Categorical
 
 from giril_rl.report.predictions import draw_predictions, foresee
-from giril_rl.rewards import AffineReward, GenerativeReward
+from giril_rl.rewards import GenerativeReward
 
 NAMES = ["NOOP", "FIRE", "DOWNRIGHTFIRE"]
 
 
 def shown(beta, scale=1.0, clamp=True, title="policy"):
-    model = GenerativeReward.for_pixels(Categorical(3), beta=beta, clamp=clamp).eval()
-    reward = model if scale == 1 else AffineReward(model, scale)
+    model = GenerativeReward.for_pixels(Categorical(3), beta=beta, scale=scale, clamp=clamp).eval()
     generator = torch.Generator().manual_seed(0)
     frames = torch.randint(0, 256, (2, 3, 4, 84, 84), generator=generator).to(torch.uint8)
     data = TensorDict(
@@ -27,11 +26,11 @@ def shown(beta, scale=1.0, clamp=True, title="policy"):
         [3],
     )
     labels = ["game 1\nstep 1,234\nnot fitted", "step 2", "step 3"]
-    found = foresee(model, reward, data, title=title, labels=labels, actions=NAMES)
+    found = foresee(model, data, title=title, labels=labels, actions=NAMES)
     return found, data
 
 
-@pytest.mark.parametrize(("beta", "scale", "clamp"), [(1, 1.0, True), (0.7, -1.0, False)])
+@pytest.mark.parametrize(("beta", "scale", "clamp"), [(1, 1.0, True), (0.7, 3.0, False)])
 def test_the_reward_is_that_of_the_prediction_that_is_shown(beta, scale, clamp):
     found, data = shown(beta, scale, clamp)
     assert found.actions == ["DOWNRIGHTFIRE", "NOOP", "FIRE"]
