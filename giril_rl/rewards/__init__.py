@@ -16,13 +16,9 @@ from giril_rl.rewards.curiosity import CuriosityReward, feature_error
 from giril_rl.rewards.curiosity_loss import CuriosityRewardLoss, FeatureTraining
 from giril_rl.rewards.discriminator import DiscriminatorReward, DiscriminatorScaling
 from giril_rl.rewards.discriminator_loss import DiscriminatorLoss
+from giril_rl.rewards.equations import blend_action, reconstruction_error
 from giril_rl.rewards.factored import factored_error
-from giril_rl.rewards.generative import (
-    GenerativeReward,
-    Prior,
-    blend_action,
-    reconstruction_error,
-)
+from giril_rl.rewards.generative import GenerativeReward, Prior
 from giril_rl.rewards.generative_loss import (
     GenerativeRewardLoss,
     action_term,

@@ -10,7 +10,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 
 from giril_rl.rewards.chunks import PIXELS_AT_ONCE, in_chunks
-from giril_rl.rewards.generative import reconstruction_error
+from giril_rl.rewards.equations import reconstruction_error
 from giril_rl.rewards.keys import REWARD_KEYS, check_keys
 from giril_rl.rewards.pixel_scaler import PixelScaler
 from giril_rl.rewards.scaler import ObservationScaler

@@ -18,41 +18,16 @@ from giril_rl.networks.pixel_decoder import PixelDecoder
 from giril_rl.networks.pixels import PixelEncoder, PixelPrior
 from giril_rl.networks.vectors import mlp
 from giril_rl.pretrained import Pretrained, remembered
+from giril_rl.rewards.action_table import ActionTable
 from giril_rl.rewards.actions import ActionEncoder
 from giril_rl.rewards.chunks import PIXELS_AT_ONCE, in_chunks
+from giril_rl.rewards.equations import blend_action, reconstruction_error
 from giril_rl.rewards.factored import factored_error
 from giril_rl.rewards.keys import REWARD_KEYS, TRANSITION_KEYS, check_keys
 from giril_rl.rewards.pixel_scaler import PixelScaler
 from giril_rl.rewards.scaler import ObservationScaler, ScalingRule
 
 Prior = Literal["standard", "conditional"]
-
-
-def reconstruction_error(predicted: Tensor, target: Tensor, dims: int = 1) -> Tensor:
-    """The squared L2 norm of ``predicted - target`` of each observation (paper, eq. 2).
-
-    Times lambda it is also ``-log p(s' | z, s)`` up to a constant (eq. 1's first term).
-
-    Args:
-        predicted: ``(*batch, *observation)``.
-        target: of the same shape.
-        dims: dimensions of one observation, the last ones: 1 for a vector, 3 for frames.
-
-    Examples:
-        >>> reconstruction_error(torch.tensor([[1.0, 2.0]]), torch.tensor([[0.0, 4.0]]))
-        tensor([5.])
-    """
-    return (predicted - target).square().flatten(-dims).sum(-1)
-
-
-def blend_action(action_code: Tensor, encoded: Tensor, beta: float) -> Tensor:
-    """``beta * a + (1 - beta) * a_hat``, what the decoder gets at reward time (paper, eq. 2).
-
-    Examples:
-        >>> blend_action(torch.tensor([1.0, 0.0]), torch.tensor([0.5, 0.5]), 0.5)
-        tensor([0.7500, 0.2500])
-    """
-    return beta * action_code + (1 - beta) * encoded
 
 
 class GenerativeReward(Pretrained, TensorDictModuleBase):
@@ -125,7 +100,7 @@ class GenerativeReward(Pretrained, TensorDictModuleBase):
         self.beta = beta
         self.scale = scale
         self._generator = torch.Generator().manual_seed(seed)
-        self._table: tuple[list[Tensor], Tensor] | None = None
+        self._table = ActionTable()
 
     @classmethod
     @remembered
@@ -278,7 +253,7 @@ class GenerativeReward(Pretrained, TensorDictModuleBase):
         """Writes each transition's reward."""
         observation, action, following = (tensordict.get(key) for key in self.in_keys)
         if self._is_factored(observation):
-            table, weight = self._action_table()
+            table, weight = self._table(cast(PixelDecoder, self.decoder))
             index = self.actions.target(action)
             clamp = self.scaler.clamp
             error = factored_error(table, weight, index, observation, following, clamp=clamp)
@@ -309,16 +284,6 @@ class GenerativeReward(Pretrained, TensorDictModuleBase):
             and not torch.is_grad_enabled()
         )
 
-    @torch.no_grad()
-    def _action_table(self) -> tuple[Tensor, Tensor]:
-        """The decoder's ``action_table`` and ``state_weight``, kept until its weights change."""
-        decoder = cast(PixelDecoder, self.decoder)
-        # The values are compared, for a fused optimiser's step changes no tensor's version.
-        weights = list(decoder.parameters())
-        if self._table is None or not all(map(_same, self._table[0], weights)):
-            self._table = [weight.clone() for weight in weights], decoder.action_table()
-        return self._table[1], decoder.state_weight
-
     def _encoded_action(self, observation: Tensor, following: Tensor) -> Tensor:
         mu, logvar = self.encode(observation, following)
         # Drawn on the CPU, so that a seed means the same on every device.
@@ -333,8 +298,3 @@ class GenerativeReward(Pretrained, TensorDictModuleBase):
     def set_extra_state(self, state: Tensor) -> None:
         """Restores the noise generator."""
         self._generator.set_state(state.cpu())
-
-
-def _same(one: Tensor, other: Tensor) -> bool:
-    alike = (one.device, one.dtype) == (other.device, other.dtype)
-    return alike and torch.equal(one, other)

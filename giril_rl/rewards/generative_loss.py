@@ -8,7 +8,8 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 
 from giril_rl.errors import UserError
-from giril_rl.rewards.generative import GenerativeReward, reconstruction_error
+from giril_rl.rewards.equations import reconstruction_error
+from giril_rl.rewards.generative import GenerativeReward
 from giril_rl.rewards.transition_loss import Reduction, TransitionLoss
 
 
