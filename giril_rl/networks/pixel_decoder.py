@@ -23,7 +23,7 @@ class PixelDecoder(nn.Module):
     ``action_table()[a] + state_part(s)``.
 
     Args:
-        actions: |A|, the size of the code.
+        actions: number of actions, the size of the code.
         channels: frames in an observation.
 
     Examples:

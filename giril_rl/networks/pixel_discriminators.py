@@ -17,7 +17,7 @@ class PixelPairNetwork(nn.Module):
     worth its value times the sum of its kernel: the planes themselves are never made.
 
     Args:
-        actions: |A|, the size of the code.
+        actions: number of actions, the size of the code.
         channels: frames in an observation.
         head: layers from the last convolution's 64x4x4 on.
 
@@ -55,7 +55,7 @@ class PixelDiscriminator(PixelPairNetwork):
     """GAIL's discriminator for pixels: one logit (paper, appendix).
 
     Args:
-        actions: |A|.
+        actions: number of actions.
         out_features: numbers per pair.
         channels: frames in an observation.
 
@@ -73,7 +73,7 @@ class PixelBottleneck(PixelPairNetwork):
     """VAIL's encoder for pixels: mean and log-variance, by a 4x4 convolution (paper, appendix).
 
     Args:
-        actions: |A|.
+        actions: number of actions.
         latent: size of the bottleneck's code.
         channels: frames in an observation.
 

@@ -29,7 +29,7 @@ class PixelActorCritic(Pretrained, nn.Module):
     leaves the trunk's output as ``"hidden"`` for the critic, so that the trunk runs once.
 
     Args:
-        actions: |A|.
+        actions: number of actions.
         channels: frames in an observation.
 
     Examples:
@@ -105,7 +105,7 @@ class PixelActor(nn.Module):
     """The trunk and the policy's head: uint8 frames to logits, what behaviour cloning fits.
 
     Args:
-        actions: |A|.
+        actions: number of actions.
         channels: frames in an observation.
 
     Examples:

@@ -87,7 +87,7 @@ class PixelEncoder(nn.Module):
     the two layers that the paper has.
 
     Args:
-        actions: |A|, the size of z.
+        actions: number of actions, the size of z.
         channels: frames in an observation.
 
     Examples:
@@ -116,7 +116,7 @@ class PixelPrior(nn.Module):
     """GIRIL's conditional prior for pixels: mean and log-variance of ``p(z | s)`` (paper, eq. 1).
 
     Args:
-        actions: |A|, the size of z.
+        actions: number of actions, the size of z.
         channels: frames in an observation.
 
     Examples:
@@ -160,7 +160,7 @@ class InverseModel(JoinedSequential):
     """ICM's logits of the action, from ``phi(s), phi(s')``: 2048 -> 64 -> |A| (paper, Table 2).
 
     Args:
-        actions: |A|.
+        actions: number of actions.
         features: size of phi.
 
     Examples:
@@ -177,7 +177,7 @@ class ForwardModel(JoinedSequential):
     """ICM's ``phi_hat(s')``, from ``phi(s), a``: 1024 + |A| -> 64 -> 1024 (paper, Table 2).
 
     Args:
-        actions: |A|.
+        actions: number of actions.
         features: size of phi.
 
     Examples:

@@ -1,0 +1,24 @@
+"""Sphinx's settings: pages in Markdown (MyST), the API from docstrings, the furo theme."""
+
+from importlib.metadata import version as installed
+
+project = "giril_rl"
+author = "giril_rl contributors"
+release = version = installed("giril-rl")
+extensions = [
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.napoleon",
+    "sphinx.ext.viewcode",
+]
+myst_enable_extensions = ["dollarmath", "colon_fence"]
+myst_heading_anchors = 3
+html_theme = "furo"
+html_title = f"giril_rl {release}"
+exclude_patterns = ["_build"]
+autodoc_default_options = {"members": True, "show-inheritance": True}
+autodoc_member_order = "bysource"
+autodoc_typehints = "description"
+autodoc_typehints_description_target = "documented"
+napoleon_use_ivar = True
+nitpicky = False
