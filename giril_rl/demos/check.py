@@ -93,6 +93,8 @@ def _check_tensors(data: TensorDict) -> None:
         raise _fault(
             f"is empty or not flat (shape {list(data.shape)}): it needs [N] transitions, N > 0."
         )
+    if data.shape[0] == 1:
+        raise _fault("has only one transition: at least 2 are needed.")
     for key in _KEYS:
         _check_tensor(_name(key), data.get(key), data.shape[0])
     if data["observation"].shape != data["next", "observation"].shape:
@@ -122,7 +124,7 @@ def _check_tensor(name: str, value: Tensor, length: int) -> None:
         raise _fault(f"has {name} of {value.dtype} and shape {shape}: it must be {dtype} {wanted}.")
     if value.is_floating_point() and not value.isfinite().all():
         index = _first(~value.isfinite())
-        raise _fault(f"has NaN or infinity in {name} at index {index}: record it anew.")
+        raise _fault(f"has NaN or infinity in {name} at index {index}: mend or record it anew.")
 
 
 def _check_task(
@@ -205,15 +207,15 @@ def _check_episodes(data: TensorDict, *, may_cut_last: bool) -> None:
         index = _first(cut)
         raise _fault(
             f"has an episode {int(episode[index])} that stops at index {index} without done: "
-            "its end is lost, record it anew."
+            "its end is lost; mark it truncated if the episode ended there, or record it anew."
         )
     moved = _differ(data["next", "observation"][:-1], data["observation"][1:]) & ~last[:-1]
     if moved.any():
         index = _first(moved)
         raise _fault(
             f"is misaligned: next.observation[{index}] is not observation[{index + 1}] within "
-            f"episode {int(episode[index])}, so actions may not belong to their states; record it "
-            "anew."
+            f"episode {int(episode[index])}, so actions may not belong to their states or an end "
+            "is not marked; mend or record it anew."
         )
 
 

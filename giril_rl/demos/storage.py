@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from tensordict import TensorDict
 from giril_rl.errors import UserError
 from giril_rl.files import sync
 
-_DTYPES = {f"torch.{name}": getattr(torch, name) for name in ("float32", "int64", "bool")}
+_DTYPES = ("float32", "int64", "bool")
 _TENSORDICT = "<class 'tensordict._td.TensorDict'>"
 
 
@@ -24,10 +25,14 @@ def save_tensors(folder: Path, transitions: TensorDict) -> None:
         sync(path)
 
 
-def load_tensors(folder: Path) -> TensorDict:
+def load_tensors(folder: Path, dtypes: Collection[str] = _DTYPES) -> TensorDict:
     """Copy a folder of :func:`save_tensors` into memory, after looking at every file of it.
 
     A memmap is written through to its files, so a copy is what keeps a demonstration as recorded.
+
+    Args:
+        folder: what a flat TensorDict, or one with ``next`` in it, was memory-mapped into.
+        dtypes: names of torch's dtypes that may be there.
 
     Raises:
         UserError: for anything that is not a plain tensor of the size that its metadata says.
@@ -41,14 +46,14 @@ def load_tensors(folder: Path) -> TensorDict:
         ...
         giril_rl.errors.UserError: ... holds 'note', which is not a plain tensor: ...
     """
-    _inspect(folder, top=True)
+    _inspect(folder, dtypes, top=True)
     try:
         return TensorDict.load_memmap(folder, allow_pickle=False).clone()
     except (OSError, RuntimeError, ValueError, KeyError, TypeError) as error:
         raise UserError(f"{folder} cannot be read ({error}): record it anew.") from None
 
 
-def _inspect(folder: Path, *, top: bool) -> None:
+def _inspect(folder: Path, dtypes: Collection[str], *, top: bool) -> None:
     try:
         meta = json.loads((folder / "meta.json").read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
@@ -61,9 +66,9 @@ def _inspect(folder: Path, *, top: bool) -> None:
             continue
         if top and key == "next" and entry == {"type": "TensorDict"}:
             expected.add("next")
-            _inspect(folder / "next", top=False)
+            _inspect(folder / "next", dtypes, top=False)
         else:
-            _inspect_tensor(folder, key, entry)
+            _inspect_tensor(folder, key, entry, dtypes)
             expected.add(f"{key}.memmap")
     # A stray file may be what an object is unpickled from.
     strays = sorted(path.name for path in folder.iterdir() if path.name not in expected)
@@ -71,13 +76,13 @@ def _inspect(folder: Path, *, top: bool) -> None:
         raise UserError(f"{folder} holds {strays[0]!r}, which is not a tensor: record it anew.")
 
 
-def _inspect_tensor(folder: Path, key: str, entry: Any) -> None:
+def _inspect_tensor(folder: Path, key: str, entry: Any, dtypes: Collection[str]) -> None:
     # Keys are the demonstration's own names: letters only, so none is a path.
     if (
         not key.isidentifier()
         or not isinstance(entry, dict)
         or set(entry) != {"device", "shape", "dtype", "is_nested"}
-        or entry["dtype"] not in _DTYPES
+        or entry["dtype"] not in [f"torch.{name}" for name in dtypes]
         or entry["is_nested"] is not False
         or entry["device"] != "cpu"
         or not isinstance(entry["shape"], list)
@@ -85,7 +90,9 @@ def _inspect_tensor(folder: Path, key: str, entry: Any) -> None:
     ):
         raise UserError(f"{folder} holds {key!r}, which is not a plain tensor: record it anew.")
     path = folder / f"{key}.memmap"
-    wanted = math.prod(entry["shape"]) * _DTYPES[entry["dtype"]].itemsize
+    wanted = (
+        math.prod(entry["shape"]) * getattr(torch, entry["dtype"].removeprefix("torch.")).itemsize
+    )
     found = path.stat().st_size if path.is_file() else None
     if found != wanted:
         state = "is missing" if found is None else f"has {found} bytes instead of {wanted}"

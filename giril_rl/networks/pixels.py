@@ -157,7 +157,7 @@ class PixelFeatures(nn.Module):
 
 
 class InverseModel(JoinedSequential):
-    """ICM's logits of the action, from ``phi(s), phi(s')``: 2048 -> 64 -> |A| (paper, Table 2).
+    """ICM's logits of the action, from ``phi(s), phi(s')``: 2048 -> 64 -> actions (paper, Table 2).
 
     Args:
         actions: number of actions.
@@ -174,7 +174,7 @@ class InverseModel(JoinedSequential):
 
 
 class ForwardModel(JoinedSequential):
-    """ICM's ``phi_hat(s')``, from ``phi(s), a``: 1024 + |A| -> 64 -> 1024 (paper, Table 2).
+    """ICM's ``phi_hat(s')``, from ``phi(s), a``: 1024 + actions -> 64 -> 1024 (paper, Table 2).
 
     Args:
         actions: number of actions.

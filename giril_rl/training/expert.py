@@ -7,7 +7,7 @@ import hashlib
 import json
 import sys
 from collections.abc import Iterator
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from giril_rl.configs import DemoConfig, ExpertConfig, ExpertRunConfig, RunConfig, TaskConfig
 from giril_rl.demos import Demonstration, check_demonstration, record_demonstration
+from giril_rl.demos.task import as_recorded_task, spaces_of
 from giril_rl.envs import gym_factory, make_env, with_own_episodes
 from giril_rl.errors import UserError
 from giril_rl.naming import out_folder, safe, without_added
@@ -133,9 +134,7 @@ def check_inputs(cfg: RunConfig, expert: ExpertConfig, demo: DemoConfig) -> None
 
 
 def _given_demonstration(task: TaskConfig, path: str) -> Demonstration:
-    env = make_env(task, 1, seed=0)
-    shape, spec = env.observation_spec["observation"].shape[1:], env.action_spec
-    env.close()
+    shape, spec = spaces_of(task)
     demo = Demonstration.load(path)
     try:
         check_demonstration(demo, shape, spec)
@@ -157,7 +156,7 @@ def obtain_demonstration(
     if demo.path is not None:
         return _given_demonstration(cfg.task, demo.path), None
     source, result = obtain_expert(cfg, expert)
-    task = _recorded_task(cfg.task, demo)
+    task = as_recorded_task(cfg.task, demo.lives)
     folder = Path(cfg.root) / demonstration_place(cfg.task, demo, result["config_hash"])
     with made_once(folder, "demonstration"):
         if not folder.exists():
@@ -190,21 +189,7 @@ def demonstration_place(task: TaskConfig, demo: DemoConfig, expert: str) -> Path
         >>> demonstration_place(pong, DemoConfig(), "0123456789ab").parent.as_posix()
         'demos/pong'
     """
-    return Path("demos") / safe(task.name) / _identity(_recorded_task(task, demo), demo, expert)
-
-
-def _recorded_task(task: TaskConfig, demo: DemoConfig) -> TaskConfig:
-    """The task as it is recorded: its own episodes, a game's up to a lost life or whole.
-
-    Examples:
-        >>> pong = TaskConfig(name="pong", env_id="ALE/Pong-v5", episode="game")
-        >>> _recorded_task(pong, DemoConfig(lives="first")).episode
-        'life'
-    """
-    task = with_own_episodes(task)
-    if not task.is_atari:
-        return task
-    return replace(task, episode="life" if demo.lives == "first" else "game")
+    return Path("demos") / safe(task.name) / _identity(as_recorded_task(task, demo.lives), demo, expert)
 
 
 def _identity(task: TaskConfig, demo: DemoConfig, expert: str) -> str:

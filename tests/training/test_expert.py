@@ -7,6 +7,7 @@ from tensordict.nn import TensorDictModule
 
 from giril_rl.configs import DemoConfig, ExpertConfig, RunConfig, TaskConfig
 from giril_rl.demos import Demonstration
+from giril_rl.demos.task import as_recorded_task
 from giril_rl.errors import UserError
 from giril_rl.training import check_inputs, expert, obtain_demonstration
 
@@ -46,7 +47,7 @@ def test_hashes_are_those_of_before_there_were_lives():
     assert expert._identity(COUNTER, DemoConfig(), "0123456789ab") == "7ed61d6c8859"
     task = replace(COUNTER, horizon="fixed")
     demo = DemoConfig(length=None, episodes=2, subsample=1, lives="all")  # Nothing to a vector.
-    recorded = expert._recorded_task(task, demo)
+    recorded = as_recorded_task(task, demo.lives)
     assert expert._identity(recorded, demo, "0123456789ab") == "36962a564bd0"
 
 
