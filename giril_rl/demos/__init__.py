@@ -1,8 +1,9 @@
-"""Demonstrations: record, check, keep, subsample, and export to Minari."""
+"""Demonstrations: record, check, keep, subsample, import and export."""
 
 from giril_rl.demos.check import check_demonstration
 from giril_rl.demos.demonstration import Demonstration
 from giril_rl.demos.minari import to_minari
+from giril_rl.demos.npz import to_npz
 from giril_rl.demos.record import record_demonstration
 from giril_rl.demos.replay import verify_by_replay
 from giril_rl.demos.subsample import holdout, subsample
@@ -14,5 +15,6 @@ __all__ = [
     "record_demonstration",
     "subsample",
     "to_minari",
+    "to_npz",
     "verify_by_replay",
 ]

@@ -66,6 +66,11 @@ class Demonstration:
         return self.transitions["observation"].dtype == torch.uint8
 
     @property
+    def has_rewards(self) -> bool:
+        """Whether the true rewards are known; where they are not, zeros stand for them."""
+        return self.card.get("rewards") is not False
+
+    @property
     def num_episodes(self) -> int:
         """How many episodes there are, the cut one included."""
         return int(self.transitions["episode"].max()) + 1 if len(self) else 0

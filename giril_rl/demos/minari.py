@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 import json
+import os
+import shutil
+import warnings
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
+from unittest.mock import patch
 
 import gymnasium
 import torch
 
 from giril_rl.demos.demonstration import Demonstration
+from giril_rl.demos.minari_read import check_name, minari_root
 from giril_rl.errors import UserError
+from giril_rl.files import temporary_sibling, write_atomically
 
 
 def to_minari(
@@ -55,6 +62,7 @@ def to_minari(
         raise UserError(
             'a Minari export needs the package minari: pip install "giril-rl[minari]".'
         ) from None
+    check_name(dataset_id)
     data = demo.transitions
     buffers = []
     seeds = demo.card.get("seeds") or [None] * demo.num_episodes
@@ -74,16 +82,12 @@ def to_minari(
                 truncations=truncated.tolist(),
             )
         )
+    # Only an export is to give the cut back: to others it is a truncation.
+    card = demo.card if demo.transitions["next", "done"][-1] else {**demo.card, "last_cut": True}
+    arguments = {"algorithm_name": algorithm_name, "description": json.dumps(card), **metadata}
     env = make_fn()
     try:
-        return minari.create_dataset_from_buffers(
-            dataset_id,
-            buffers,
-            env=env,
-            algorithm_name=algorithm_name,
-            description=json.dumps(demo.card),
-            **metadata,
-        )
+        _create(minari, dataset_id, buffers, env, arguments)
     except (ValueError, AssertionError) as error:
         raise UserError(
             f"Minari refuses {dataset_id!r} ({error}): give a new name such as "
@@ -91,3 +95,31 @@ def to_minari(
         ) from None
     finally:
         env.close()
+    return minari.load_dataset(dataset_id)
+
+
+def _create(
+    minari: Any, dataset_id: str, buffers: list[Any], env: gymnasium.Env, arguments: dict[str, Any]
+) -> None:
+    """Writes the dataset beside all others, then moves it to where Minari looks for it."""
+    root = minari_root()
+    folder = root / dataset_id
+    if folder.exists():
+        raise ValueError("it is there already")
+    root.mkdir(parents=True, exist_ok=True)
+    temporary = temporary_sibling(root / "export")
+    shutil.rmtree(temporary, ignore_errors=True)
+    try:
+        with patch.dict(os.environ, MINARI_DATASETS_PATH=str(temporary)), warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # An author's name is nobody's duty.
+            minari.create_dataset_from_buffers(
+                dataset_id, buffers, env=env, jpeg_encoding=False, **arguments
+            )
+        for part in reversed(Path(dataset_id).parents[:-1]):
+            (root / part).mkdir(exist_ok=True)
+            note = root / part / "namespace_metadata.json"
+            if not note.exists():
+                write_atomically(note, "{}")
+        (temporary / dataset_id).replace(folder)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)

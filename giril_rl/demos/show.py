@@ -5,6 +5,7 @@ from __future__ import annotations
 from giril_rl.demos.demonstration import Demonstration
 
 _LIVES = {"first": ", each up to the first lost life", "all": ", each through all lives"}
+_PLAYED = {"True": "deterministic", "False": "sampled", "by hand": "by hand"}
 _ENDS = {"first": "life lost", "all": "game over"}
 
 
@@ -38,7 +39,7 @@ def describe(demo: Demonstration) -> str:
     lives = str(card.get("lives"))
     shape = list(demo.transitions["observation"].shape[1:])
     images = f"images {' x '.join(map(str, shape))}"
-    played = "deterministic" if card.get("deterministic") else "sampled"
+    played = _PLAYED.get(str(card.get("deterministic")), "not known how")
     rows = {
         "task": f"{card.get('task')} ({card.get('env_id')})",
         "transitions": f"{len(demo):,}",
@@ -48,6 +49,10 @@ def describe(demo: Demonstration) -> str:
         "played": f"{played}, seed {card.get('seed')}",
         "expert": _expert(card.get("expert")),
     }
+    source = card.get("source")
+    if isinstance(source, dict):
+        rows["source"] = f"{source.get('name')} ({source.get('format')})"
+        rows["replay"] = str(card.get("replay"))
     width = max(map(len, rows)) + 2
     lines = [f"{name:<{width}}{value}" for name, value in rows.items()]
     return "\n".join([*lines, "", *_episodes(demo, _ENDS.get(lives, "terminated"))])
@@ -85,6 +90,7 @@ def _episodes(demo: Demonstration, ended: str) -> list[str]:
             end = ended
         else:
             end = "time limit" if after["truncated"][row] else "cut"
-        rows.append((str(number), f"{length:,}", f"{score:,.1f}", end))
+        shown = f"{score:,.1f}" if demo.has_rewards else "unknown"
+        rows.append((str(number), f"{length:,}", shown, end))
     first, second, third, _ = (max(map(len, column)) for column in zip(*rows, strict=True))
     return [f"{a:>{first}}  {b:>{second}}  {c:>{third}}  {d}" for a, b, c, d in rows]

@@ -81,7 +81,7 @@ def finish_run(
         "wall_seconds": trained.seconds,
         "steps_per_second": trained.steps / max(trained.seconds, 1e-9),
         "expert_return_mean": None if expert is None else expert["return_mean"],
-        "demo_return_mean": None if demo is None else _mean_return(demo),
+        "demo_return_mean": _mean_return(demo) if demo is not None and demo.has_rewards else None,
         "demo_transitions": None if demo is None else len(demo),
         "config_hash": config_hash(cfg),
         "versions": run.versions,

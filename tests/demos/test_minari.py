@@ -18,7 +18,6 @@ def cartpole():
     return record_demonstration(make_fn, lambda o: (o[:, 2] > 0).long(), length=100, seed=0)
 
 
-@pytest.mark.filterwarnings("ignore:.* is set to None")
 def test_export_holds_every_transition(cartpole, tmp_path, monkeypatch):
     minari = pytest.importorskip("minari")
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
@@ -38,9 +37,26 @@ def test_export_holds_every_transition(cartpole, tmp_path, monkeypatch):
         start += length
     assert episode.truncations[-1] and not episode.terminations[-1]  # the one that was cut
     assert not cartpole.transitions["next", "truncated"].any()  # ours is left as it was
-    assert json.loads(dataset.storage.metadata["description"]) == cartpole.card
+    card = json.loads(dataset.storage.metadata["description"])
+    assert card == {**cartpole.card, "last_cut": True}
     with pytest.raises(UserError, match="refuses 'cartpole/test-v0'"):
         to_minari(cartpole, "cartpole/test-v0", make_fn)
+    assert list(minari.list_local_datasets()) == ["cartpole/test-v0"]
+    assert minari.namespace.list_local_namespaces() == ["cartpole"]
+
+
+def test_a_failed_export_leaves_nothing(cartpole, tmp_path, monkeypatch):
+    minari = pytest.importorskip("minari")
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+
+    def fail(self, episodes):
+        raise OSError("no space left")
+
+    monkeypatch.setattr("minari.dataset._storages.hdf5_storage.HDF5Storage.update_episodes", fail)
+    with pytest.raises(OSError, match="no space left"):
+        to_minari(cartpole, "cartpole/test-v0", make_fn)
+    assert list(tmp_path.iterdir()) == []
+    assert minari.list_local_datasets() == {}
 
 
 def test_missing_package_names_the_extra(cartpole, monkeypatch):

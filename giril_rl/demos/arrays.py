@@ -1,0 +1,209 @@
+"""From the plain arrays of someone else's data set to the columns of a demonstration."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+import torch
+from tensordict import TensorDict
+from torch import Tensor
+
+from giril_rl.errors import UserError
+
+NEEDED = ("observation", "action", "next_observation", "terminated", "truncated")
+"""One row per transition each; ``reward`` may be there as well."""
+_FLAGS = ("terminated", "truncated")
+_LOSSLESS_ENOUGH = "fiu"  # numpy's kinds: float, signed and unsigned integer
+
+
+def to_transitions(columns: Mapping[str, np.ndarray]) -> TensorDict:
+    """One row per transition as a demonstration stores it; nothing about it is proved yet.
+
+    Numbers of observations, continuous actions and rewards become float32, as the recorder makes
+    them, integer actions int64; images, uint8 [N, c, h, w], stay what they are. ``done`` is
+    terminated or truncated; ``episode`` and ``step``, if not there, are counted from it. Rewards
+    that are not there are zeros.
+
+    Args:
+        columns: arrays named as in :data:`NEEDED`, and ``reward``, ``episode`` and ``step`` if
+            known; flags and rewards [N] or [N, 1].
+
+    Raises:
+        UserError: for a column that is missing, of another length, or no numbers.
+
+    Examples:
+        >>> zero = np.zeros((3, 2), np.float32)
+        >>> end = np.array([False, True, True])
+        >>> data = to_transitions({
+        ...     "observation": zero, "next_observation": zero, "action": np.array([0, 1, 1]),
+        ...     "terminated": end, "truncated": ~end & False,
+        ... })
+        >>> data["episode"].tolist(), data["step"].tolist(), data["next", "reward"].shape
+        ([0, 0, 1], [0, 1, 0], torch.Size([3, 1]))
+    """
+    for name in NEEDED:
+        if name not in columns:
+            raise UserError(_missing(name))
+    lengths = {name: len(column) if column.ndim else 0 for name, column in columns.items()}
+    length = lengths["action"]
+    for name, found in lengths.items():
+        if found != length:
+            raise UserError(
+                f"the data set has {length} rows of action and {found} of {name}: each needs one "
+                "row per transition."
+            )
+    if length == 0:
+        raise UserError("the data set is empty: at least 2 transitions are needed.")
+    flags = {name: _flag(name, columns[name]) for name in _FLAGS}
+    done = flags["terminated"] | flags["truncated"]
+    reward = columns.get("reward", np.zeros(length, np.float32))
+    after = {
+        "observation": _observation("next_observation", columns["next_observation"]),
+        "reward": torch.from_numpy(_single(_float32("reward", reward))),
+        "done": torch.from_numpy(done),
+        **{name: torch.from_numpy(flag) for name, flag in flags.items()},
+    }
+    episode, step = _counted(done.reshape(-1))
+    for name, counted in (("episode", episode), ("step", step)):
+        given = columns.get(name)
+        if given is not None and (given.dtype != np.int64 or given.ndim != 1):
+            raise UserError(f"the data set has {name} of {_described(given)}: leave it out.")
+        if given is not None:
+            counted[:] = given
+    return TensorDict(
+        {
+            "observation": _observation("observation", columns["observation"]),
+            "action": _action(columns["action"]),
+            "episode": torch.from_numpy(episode),
+            "step": torch.from_numpy(step),
+            "next": TensorDict(after, [length]),
+        },
+        [length],
+    )
+
+
+def from_episodes(episodes: Iterable[Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    """Columns for :func:`to_transitions` of whole episodes with one more observation than actions.
+
+    Args:
+        episodes: each with ``observations`` [T + 1, ...], ``actions`` [T, ...], ``terminated`` and
+            ``truncated`` [T], and ``rewards`` [T] in all or none of them.
+
+    Raises:
+        UserError: naming the episode whose next states are missing or whose numbers do not match.
+
+    Examples:
+        >>> no = np.zeros(2, bool)
+        >>> columns = from_episodes([{"observations": np.arange(3.0)[:, None], "actions": no,
+        ...                           "terminated": no, "truncated": no}])
+        >>> columns["observation"].tolist(), columns["next_observation"].tolist()
+        ([[0.0], [1.0]], [[1.0], [2.0]])
+        >>> columns["step"].tolist()
+        [0, 1]
+    """
+    parts: dict[str, list[np.ndarray]] = {}
+    for number, episode in enumerate(episodes):
+        observations, actions = episode["observations"], episode["actions"]
+        if actions.ndim == 0 or observations.ndim == 0:
+            raise UserError(f"episode {number} of the data set has single numbers: it needs rows.")
+        if len(observations) != len(actions) + 1:
+            raise UserError(
+                f"episode {number} of the data set has {len(observations)} observations and "
+                f"{len(actions)} actions, so next states are missing or misaligned: it needs one "
+                "observation more than actions, the last one after the last action."
+            )
+        rows = {
+            "observation": observations[:-1],
+            "action": actions,
+            "next_observation": observations[1:],
+            "terminated": episode["terminated"],
+            "truncated": episode["truncated"],
+            # Not counted from the ends: they are to be where the episodes end.
+            "episode": np.full(len(actions), number, np.int64),
+            "step": np.arange(len(actions), dtype=np.int64),
+        }
+        if "rewards" in episode:
+            rows["reward"] = episode["rewards"]
+        for name, row in rows.items():
+            if row.ndim == 0 or len(row) != len(actions):
+                raise UserError(
+                    f"episode {number} of the data set has {len(actions)} actions and "
+                    f"{len(row) if row.ndim else 'no'} rows of {name}: each needs as many."
+                )
+            parts.setdefault(name, []).append(row)
+    try:
+        return {name: np.concatenate(rows) for name, rows in parts.items()}
+    except (ValueError, TypeError) as error:
+        raise UserError(f"the data set's episodes do not fit each other ({error}).") from None
+
+
+def _missing(name: str) -> str:
+    if name == "next_observation":
+        return (
+            "the data set has no next_observation, so next states are missing: give them, or "
+            "observations with one row more than actions in each episode."
+        )
+    return f"the data set has no {name}: needed are {', '.join(NEEDED)}."
+
+
+def _described(array: np.ndarray) -> str:
+    return f"{array.dtype} and shape {list(array.shape)}"
+
+
+def _float32(name: str, array: np.ndarray) -> np.ndarray:
+    if array.dtype.kind not in _LOSSLESS_ENOUGH:
+        raise UserError(f"the data set has {name} of {_described(array)}: numbers are needed.")
+    with np.errstate(over="ignore"):  # The check of infinities tells where.
+        return np.ascontiguousarray(array, dtype=np.float32)
+
+
+def _single(array: np.ndarray) -> np.ndarray:
+    """[N] or [N, 1] as [N, 1]; any other shape as it is, for the check to refuse."""
+    return array[:, None] if array.ndim == 1 else array
+
+
+def _flag(name: str, array: np.ndarray) -> np.ndarray:
+    if array.dtype != np.bool_ or _single(array).shape != (len(array), 1):
+        raise UserError(
+            f"the data set has {name} of {_described(array)}: it must be bool "
+            f"[{len(array)}], true where an episode ends so."
+        )
+    return np.ascontiguousarray(_single(array))
+
+
+def _observation(name: str, array: np.ndarray) -> Tensor:
+    if array.ndim > 2 and array.dtype != np.uint8:
+        raise UserError(
+            f"the data set has {name} of {_described(array)}: images must be uint8 [N, c, h, w], "
+            "vectors [N, d]."
+        )
+    if array.dtype == np.uint8 and array.ndim == 4:
+        return torch.from_numpy(np.array(array, order="C"))
+    if array.dtype.kind != "f" or array.ndim != 2:
+        raise UserError(
+            f"the data set has {name} of {_described(array)}: vectors must be float32 or float64 "
+            "[N, d], images uint8 [N, c, h, w]."
+        )
+    return torch.from_numpy(_float32(name, array))
+
+
+def _action(array: np.ndarray) -> Tensor:
+    if array.dtype.kind in "iu" and array[:1].size <= 1:
+        if array.size and array.max() > np.iinfo(np.int64).max:
+            raise UserError(f"the data set has the action {array.max()}: no task has so many.")
+        return torch.from_numpy(array.reshape(-1).astype(np.int64))
+    if array.dtype.kind != "f" or array.ndim != 2:
+        raise UserError(
+            f"the data set has action of {_described(array)}: continuous ones must be float32 or "
+            "float64 [N, a], discrete ones integers [N]."
+        )
+    return torch.from_numpy(_float32("action", array))
+
+
+def _counted(done: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Numbers of the episode and of the step in it, both int64 [N], from where episodes end."""
+    fresh = np.concatenate([[True], done[:-1]])[: len(done)]
+    episode = np.cumsum(fresh) - 1
+    index = np.arange(len(done))
+    return episode.astype(np.int64), (index - index[fresh][episode]).astype(np.int64)

@@ -1,0 +1,200 @@
+"""Demonstrations as ``.npz`` files, with nothing in them but plain arrays."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import zipfile
+import zlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from giril_rl.demos.arrays import NEEDED, from_episodes
+from giril_rl.demos.demonstration import Demonstration
+from giril_rl.errors import UserError
+from giril_rl.files import sync, temporary_sibling
+from giril_rl.nearest import did_you_mean
+
+EPISODES = ("observations", "actions", "lengths", "terminated")
+_KNOWN = {*NEEDED, "reward", *EPISODES, "rewards", "card"}
+_BROKEN = (OSError, ValueError, EOFError, KeyError, RuntimeError, zipfile.BadZipFile, zlib.error)
+MOST_PACKED = 1100
+"""Deflate makes nothing smaller than to a 1032nd: more is a file that lies about its size."""
+
+
+def read_npz(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Columns for :func:`~giril_rl.demos.arrays.to_transitions`, and a card of untrusted values.
+
+    Either one row per transition: ``observation``, ``action``, ``next_observation``,
+    ``terminated`` and ``truncated`` [N, ...], ``reward`` if known. Or whole episodes one after
+    another: ``observations`` [N + E, ...], T + 1 rows for an episode of T actions, ``actions``
+    [N, ...], ``lengths`` int [E], ``terminated`` bool [E] (the others ended at a time limit),
+    ``rewards`` [N] if known. Nothing is unpickled, and nothing read before its size is known.
+
+    Raises:
+        UserError: for a file that is damaged, or holds anything else.
+
+    Examples:
+        >>> import tempfile
+        >>> path = Path(tempfile.mkdtemp()) / "two_episodes.npz"
+        >>> np.savez(path, observations=np.zeros((5, 4)), actions=np.array([0, 1, 1]),
+        ...          lengths=np.array([2, 1]), terminated=np.array([True, False]))
+        >>> read_npz(path)[0]["truncated"].tolist()
+        [False, False, True]
+    """
+    if not path.is_file():
+        raise UserError(f"there is no file {path}: name an .npz file.")
+    try:
+        with zipfile.ZipFile(path) as archive:
+            arrays = {name: _array(archive, name) for name in _names(archive)}
+    except _BROKEN as error:
+        raise UserError(
+            f"{path.name} is no .npz file, or was cut short ({error}): write it anew."
+        ) from None
+    card = _card(arrays.pop("card", None))
+    return (_whole(arrays) if "lengths" in arrays else arrays), card
+
+
+def to_npz(demo: Demonstration, path: Path | str) -> None:
+    """Write a demonstration, one row per transition, such that the import gives the same bits back.
+
+    Args:
+        demo: what to export; unknown rewards are left out.
+        path: the file, ending in ``.npz``.
+
+    Raises:
+        UserError: if the file is there already, or is named otherwise.
+
+    Examples:
+        >>> demo = Demonstration.load("runs/demos/cartpole/0a1b")  # doctest: +SKIP
+        >>> to_npz(demo, "cartpole.npz")  # doctest: +SKIP
+    """
+    path = Path(path)
+    if path.suffix != ".npz":
+        raise UserError(f"{path} does not end in .npz: name the file so.")
+    if path.exists():
+        raise UserError(f"{path} is there already: choose another name, or delete it.")
+    if not path.parent.is_dir():
+        raise UserError(f"{path} cannot be written: there is no folder {path.parent}.")
+    after = demo.transitions["next"]
+    columns = {
+        "observation": demo.transitions["observation"],
+        "action": demo.transitions["action"],
+        "next_observation": after["observation"],
+        "terminated": after["terminated"].reshape(-1),
+        "truncated": after["truncated"].reshape(-1),
+    }
+    if demo.has_rewards:
+        columns["reward"] = after["reward"].reshape(-1)
+    arrays = {name: column.cpu().numpy() for name, column in columns.items()}
+    arrays["card"] = np.frombuffer(json.dumps(demo.card).encode(), np.uint8)
+    temporary = temporary_sibling(path)
+    try:
+        with open(temporary, "wb") as file:
+            np.savez_compressed(file, allow_pickle=False, **arrays)
+        sync(temporary)
+        temporary.replace(path)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            temporary.unlink()
+        raise
+
+
+def _names(archive: zipfile.ZipFile) -> list[str]:
+    files = [member.filename for member in archive.infolist()]
+    names = [file.removesuffix(".npy") for file in files]
+    for file, name in zip(files, names, strict=True):
+        if names.count(name) > 1:
+            raise UserError(f"the .npz file holds {file!r} twice: write it anew.")
+        if name not in _KNOWN or file == name:
+            hint = did_you_mean(name, _KNOWN) or "; leave it out."
+            raise UserError(f"{file!r} in the .npz file is not an array of a demonstration{hint}")
+    return names
+
+
+def _array(archive: zipfile.ZipFile, name: str) -> np.ndarray:
+    member = archive.getinfo(f"{name}.npy")
+    with archive.open(member) as file:
+        version = np.lib.format.read_magic(file)
+        if version not in ((1, 0), (2, 0)):
+            raise UserError(f"{name} in the .npz file has another format: save it with numpy anew.")
+        first = version == (1, 0)
+        read = np.lib.format.read_array_header_1_0 if first else np.lib.format.read_array_header_2_0
+        shape, _, dtype = read(file)
+        if dtype.hasobject or dtype.kind not in "fiub":
+            raise UserError(
+                f"{name} in the .npz file is of {dtype}, not plain numbers: nothing is unpickled, "
+                "so save arrays of numbers."
+            )
+        size = file.tell() + math.prod(shape) * dtype.itemsize
+    if member.file_size != size or size > MOST_PACKED * max(member.compress_size, 1):
+        raise ValueError(f"{name} has not the size that it says")
+    with archive.open(member) as file:
+        return np.lib.format.read_array(file, allow_pickle=False)
+
+
+def _card(array: np.ndarray | None) -> dict[str, Any]:
+    """The card of an export; what others call so is worth nothing here."""
+    try:
+        card = json.loads(array.tobytes()) if array is not None else {}
+    except (ValueError, RecursionError):
+        card = {}
+    return card if isinstance(card, dict) else {}
+
+
+def _whole(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    for name in EPISODES:
+        if name not in arrays:
+            raise UserError(f"the .npz file has lengths and no {name}: add it, for each episode.")
+    foreign = sorted(set(arrays) - {*EPISODES, "rewards"})
+    if foreign:
+        raise UserError(
+            f"the .npz file has both lengths, for whole episodes, and {foreign[0]}, for single "
+            "transitions: leave one out."
+        )
+    lengths, ended = arrays["lengths"], arrays["terminated"]
+    observations, actions = arrays["observations"], arrays["actions"]
+    if (
+        lengths.ndim != 1
+        or lengths.dtype.kind not in "iu"
+        or (lengths < 1).any()
+        or not len(lengths)
+    ):
+        raise UserError("lengths in the .npz file must be integers of at least 1, one per episode.")
+    if ended.dtype != np.bool_ or ended.shape != lengths.shape:
+        raise UserError(
+            "terminated in the .npz file must be bool, one per episode, as lengths is: true where "
+            "the episode ended by itself."
+        )
+    total, count = sum(lengths.tolist()), len(lengths)
+    rows = {
+        "actions": (actions, total),
+        "observations": (observations, total + count),
+        "rewards": (arrays.get("rewards", actions), total),
+    }
+    for name, (array, wanted) in rows.items():
+        found = len(array) if array.ndim else 0
+        if found != wanted:
+            raise UserError(
+                f"the .npz file has {found} rows of {name} and lengths ask for {wanted} "
+                f"({total} steps in {count} episodes, one observation more than actions in each): "
+                "next states are missing, or an episode is cut."
+            )
+    episodes, start = [], 0
+    for number, length in enumerate(lengths.tolist()):
+        part = slice(start, start + length)
+        last = np.arange(length) == length - 1
+        episodes.append(
+            {
+                "observations": observations[start + number : start + number + length + 1],
+                "actions": actions[part],
+                "terminated": last & ended[number],
+                "truncated": last & ~ended[number],
+                **({"rewards": arrays["rewards"][part]} if "rewards" in arrays else {}),
+            }
+        )
+        start += length
+    return from_episodes(episodes)
