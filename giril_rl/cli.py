@@ -139,7 +139,7 @@ def _eval(argv: Sequence[str]) -> int:
 
 
 def _demo(argv: Sequence[str]) -> int:
-    """Show what a demonstration holds."""
+    """Show a demonstration, import, export or play one."""
     from giril_rl.cli_demo import demo
 
     return demo(argv, _demo.__doc__)
@@ -185,7 +185,7 @@ _COMMANDS: dict[str, tuple[Callable[[Sequence[str]], int], str]] = {
     "cp": (_cp, "giril cp RECIPE FILE"),
     "run": (_run, "giril run RECIPE [key=value ...] [-m] [--help]"),
     "eval": (_eval, "giril eval RUN [--episodes N] [--seed S]"),
-    "demo": (_demo, "giril demo show PATH [--out FILE.gif] [--fps N]"),
+    "demo": (_demo, "giril demo show|import|export|play ... [--help]"),
     "study": (_study, "giril study STUDY [key=value ...] [--dry-run]"),
     "report": (_report, "giril report DIR [--out FOLDER]"),
 }

@@ -125,7 +125,12 @@ def test_vectors_have_no_picture(vectors, capsys):
 @pytest.mark.parametrize(
     ("argv", "sentence"),
     [
-        ([], "the following arguments are required: show, PATH; see `giril demo --help`."),
+        (
+            [],
+            "the following arguments are required: show|import|export|play; see "
+            "`giril demo --help`.",
+        ),
+        (["show"], "the following arguments are required: PATH; see `giril demo show --help`."),
         (
             ["show", "nowhere"],
             "nowhere is not the folder of a demonstration: recipes keep theirs in "
@@ -159,9 +164,19 @@ def test_a_damaged_demonstration_is_refused(images, capsys):
     assert "frames.npz is damaged" in refused(capsys, "demo", "show", "images")
 
 
-@pytest.mark.parametrize("argv", [["demo", "--help"], ["demo", "show", "--help"]])
-def test_help(argv, capsys):
+@pytest.mark.parametrize(
+    ("argv", "words"),
+    [
+        ([], ["show", "import", "export", "play", "Print what a demonstration holds."]),
+        (["show"], ["PATH", "FILE.gif"]),
+        (["import"], ["SOURCE", "minari:NAME", "--task", "--env-id", "--out", "--episodes"]),
+        (["export"], ["FOLDER", "--minari", "--npz"]),
+        (["play"], ["--task", "--lives", "--seed"]),
+    ],
+)
+def test_help(argv, words, capsys):
     with pytest.raises(SystemExit) as leaving:
-        main(argv)
+        main(["demo", *argv, "--help"])
     assert leaving.value.code == 0
-    assert "FILE.gif" in capsys.readouterr().out
+    page = capsys.readouterr().out
+    assert all(word in page for word in words)

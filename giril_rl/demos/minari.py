@@ -107,7 +107,7 @@ def _create(
     if folder.exists():
         raise ValueError("it is there already")
     root.mkdir(parents=True, exist_ok=True)
-    temporary = temporary_sibling(root / "export")
+    temporary = temporary_sibling(root / "export").resolve()  # Minari mistakes relative ones.
     shutil.rmtree(temporary, ignore_errors=True)
     try:
         with patch.dict(os.environ, MINARI_DATASETS_PATH=str(temporary)), warnings.catch_warnings():
