@@ -2,6 +2,7 @@
 
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import gymnasium
@@ -228,3 +229,37 @@ def test_a_recipe_takes_what_was_imported():
     with pytest.raises(UserError, match="does not fit CartPole-v1"):
         cart = RunConfig(task=named_task(None, "CartPole-v1"))
         check_inputs(cart, ExpertConfig(), DemoConfig(path="demo"))
+
+
+@pytest.mark.filterwarnings("ignore:.* is set to None")
+def test_what_minari_itself_wrote_is_replayed_from_its_seeds():
+    """In double precision, with infos, as its data collector leaves it."""
+    minari = pytest.importorskip("minari")
+    from minari.data_collector import EpisodeBuffer
+
+    env, buffers = gymnasium.make(datasets.ENV, max_episode_steps=20), []
+    for number, seed in enumerate((7, 8)):
+        observations, steps = [env.reset(seed=seed)[0]], []
+        while not (steps and steps[-1][3]):
+            action = -observations[-1][1:2]
+            observation, *outcome = env.step(action)
+            observations.append(observation)
+            steps.append((action, *outcome))
+        actions, rewards, terminations, truncations, _ = zip(*steps, strict=True)
+        buffer = EpisodeBuffer(
+            id=number,
+            seed=seed,
+            observations=np.array(observations, np.float64),
+            actions=np.array(actions),
+            rewards=list(rewards),
+            terminations=list(terminations),
+            truncations=list(truncations),
+            infos={"x": np.zeros(21)},
+        )
+        buffers.append(buffer)
+    minari.create_dataset_from_buffers("collected-v0", buffers, env=env)
+    env.close()
+    task = replace(PENDULUM, max_episode_steps=20)
+    demo = import_demonstration("minari:collected-v0", task)
+    assert (len(demo), demo.num_episodes, demo.card["seeds"]) == (40, 2, [7, 8])
+    assert demo.card["replay"] == "same bits"
