@@ -11,7 +11,7 @@ from giril_rl.networks.pixels import FEATURES, conv_stack, flat_frames, xavier
 
 
 class PixelPairNetwork(nn.Module):
-    """The encoder's convolutions on the frames and a plane for each action that repeats the action's code.
+    """The encoder's convolutions on the frames and, for each action, a plane of its code.
 
     A plane of one value is the same under every position of an unpadded kernel, so each plane is
     worth its value times the sum of its kernel: the planes themselves are never made.

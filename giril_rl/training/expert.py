@@ -189,7 +189,8 @@ def demonstration_place(task: TaskConfig, demo: DemoConfig, expert: str) -> Path
         >>> demonstration_place(pong, DemoConfig(), "0123456789ab").parent.as_posix()
         'demos/pong'
     """
-    return Path("demos") / safe(task.name) / _identity(as_recorded_task(task, demo.lives), demo, expert)
+    identity = _identity(as_recorded_task(task, demo.lives), demo, expert)
+    return Path("demos") / safe(task.name) / identity
 
 
 def _identity(task: TaskConfig, demo: DemoConfig, expert: str) -> str:
