@@ -18,7 +18,7 @@ def task(env_id):
 
 def test_only_atari_has_settings_of_its_own():
     assert task_defaults(PENDULUM) == {}
-    whole = yaml.safe_load((shipped_conf() / "atari.yaml").read_text())
+    whole = yaml.safe_load((shipped_conf() / "kind" / "atari.yaml").read_text())
     assert task_defaults(PONG) == flat(whole)
     assert task_defaults(PONG)["ppo.clip_value"] is True
 

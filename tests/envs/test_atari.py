@@ -2,6 +2,7 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
+import yaml
 from gymnasium.wrappers import AtariPreprocessing
 from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
@@ -10,6 +11,7 @@ from giril_rl.configs import TaskConfig
 from giril_rl.envs import AtariEnv, AtariGymEnv, for_scores, gym_factory, make_env
 from giril_rl.envs.atari_game import AtariGame
 from giril_rl.errors import UserError
+from giril_rl.recipes import shipped_conf
 
 ale_py = pytest.importorskip("ale_py")
 gymnasium.register_envs(ale_py)
@@ -31,6 +33,15 @@ ACTIONS = {
     "seaquest": 18,
     "kung_fu_master": 14,
 }
+
+
+def test_shipped_games_are_these_with_whole_batches_of_steps():
+    for name, game in IDS.items():
+        task = TaskConfig(**yaml.safe_load((shipped_conf() / "task" / f"{name}.yaml").read_text()))
+        assert (task.name, task.env_id) == (name, f"ALE/{game}-v5")
+        batch = 8 * 128
+        assert task.steps == 50_000_000 // batch * batch
+        assert task.expert_steps == 10_000_000 // batch * batch
 
 
 def raw_env(game):
