@@ -9,9 +9,21 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from giril_rl.transforms import BatchMeanReward, IntrinsicReward, ReturnScaling
+    from giril_rl.transforms import (
+        BatchMeanReward,
+        IntrinsicReward,
+        ReturnScaling,
+        RewardWeightSyncScheme,
+        WeightedReward,
+    )
 
-__all__ = ["BatchMeanReward", "IntrinsicReward", "ReturnScaling"]
+__all__ = [
+    "BatchMeanReward",
+    "IntrinsicReward",
+    "ReturnScaling",
+    "RewardWeightSyncScheme",
+    "WeightedReward",
+]
 
 
 def __getattr__(name: str) -> Any:

@@ -26,6 +26,7 @@ class BottleneckLoss(DiscriminatorLoss):
         beta_step: the dual step on beta.
         beta: its first value; beta is a buffer, saved with the module.
         penalty: weight of the gradient penalty, taken at the mean of z; 0 leaves it out.
+        functional: see :class:`~giril_rl.rewards.TransitionLoss`.
 
     Raises:
         UserError: for a negative number.
@@ -53,8 +54,9 @@ class BottleneckLoss(DiscriminatorLoss):
         beta_step: float = 1e-2,
         beta: float = 0.0,
         penalty: float = 0.0,
+        functional: bool = False,
     ) -> None:
-        super().__init__(reward, penalty=penalty)
+        super().__init__(reward, penalty=penalty, functional=functional)
         for name, value in {
             "information": information,
             "beta_step": beta_step,

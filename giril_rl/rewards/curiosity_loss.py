@@ -35,6 +35,7 @@ class CuriosityRewardLoss(TransitionLoss):
         reward: the module to train; its parameters are this loss's parameters.
         features: what trains phi.
         reduction: ``"mean"``, ``"sum"`` or ``"none"`` over transitions.
+        functional: see :class:`~giril_rl.rewards.TransitionLoss`.
 
     Raises:
         UserError: for an unknown ``features`` or ``reduction``.
@@ -59,8 +60,9 @@ class CuriosityRewardLoss(TransitionLoss):
         *,
         features: FeatureTraining = "inverse",
         reduction: Reduction = "mean",
+        functional: bool = False,
     ) -> None:
-        super().__init__(reward, reduction=reduction)
+        super().__init__(reward, reduction=reduction, functional=functional)
         if features not in get_args(FeatureTraining):
             raise UserError(f"features={features!r} is unknown: choose inverse, both or none.")
         self.features: FeatureTraining = features

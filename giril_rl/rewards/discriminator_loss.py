@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import dispatch
+from tensordict.nn import TensorDictParams, dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.objectives import LossModule
@@ -14,6 +14,7 @@ from torchrl.objectives import LossModule
 from giril_rl.errors import UserError
 from giril_rl.rewards.adversarial import discriminator_loss, gradient_penalty, interpolated
 from giril_rl.rewards.discriminator import DiscriminatorReward
+from giril_rl.rewards.functional import hold_reward, reward_parameters
 
 
 class DiscriminatorLoss(LossModule):
@@ -31,11 +32,12 @@ class DiscriminatorLoss(LossModule):
     The two sets lie beside each other, usually under ``"expert"`` and ``"policy"``; each is flat,
     ``(n, ...)``. Their sizes may differ; the TensorDict that holds both then has no batch
     dimension. Without penalty and for equal sizes the loss is that of TorchRL's ``GAILLoss``, which
-    wants probabilities.
+    wants probabilities. There is no ``reduction``: each term is a mean over a set of its own.
 
     Args:
         reward: the module to train; its parameters are this loss's parameters.
         penalty: weight of the gradient penalty; 0 leaves it out.
+        functional: see :class:`~giril_rl.rewards.TransitionLoss`.
 
     Raises:
         UserError: for a negative penalty.
@@ -68,12 +70,17 @@ class DiscriminatorLoss(LossModule):
     default_keys = _AcceptedKeys
     tensor_keys: _AcceptedKeys
     reward: DiscriminatorReward
+    reward_params: TensorDictParams
+    target_reward_params: TensorDictParams
 
-    def __init__(self, reward: DiscriminatorReward, *, penalty: float = 0.0) -> None:
+    def __init__(
+        self, reward: DiscriminatorReward, *, penalty: float = 0.0, functional: bool = False
+    ) -> None:
         super().__init__()
         if not penalty >= 0:
             raise UserError(f"penalty={penalty} is negative: give a weight of 0 or more.")
-        self.reward = reward
+        hold_reward(self, reward, functional)
+        self._functional = functional
         self.penalty = penalty
         observation, action = (k if isinstance(k, tuple) else (k,) for k in reward.in_keys)
         self.set_keys(
@@ -82,6 +89,11 @@ class DiscriminatorLoss(LossModule):
             policy_observation=("policy", *observation),
             policy_action=("policy", *action),
         )
+
+    @property
+    def functional(self) -> bool:
+        """Whether the parameters are kept apart from the module, under ``reward_params``."""
+        return self._functional
 
     @property
     def in_keys(self) -> list[NestedKey]:
@@ -104,6 +116,10 @@ class DiscriminatorLoss(LossModule):
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """The terms and what is logged, all scalars."""
+        with reward_parameters(self):
+            return self._terms(tensordict)
+
+    def _terms(self, tensordict: TensorDictBase) -> TensorDictBase:
         entries = [tensordict.get(key) for key in self.in_keys]
         expert = self.reward.inputs(*entries[:2])
         policy = self.reward.inputs(*entries[2:])

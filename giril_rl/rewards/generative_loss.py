@@ -80,6 +80,7 @@ class GenerativeRewardLoss(TransitionLoss):
         alpha: weight of the action term; None takes 1 for continuous actions and 100 for discrete
             ones.
         reduction: ``"mean"``, ``"sum"`` or ``"none"`` over transitions.
+        functional: see :class:`~giril_rl.rewards.TransitionLoss`.
 
     Raises:
         UserError: for an unknown reduction or a negative alpha.
@@ -103,8 +104,9 @@ class GenerativeRewardLoss(TransitionLoss):
         *,
         alpha: float | None = None,
         reduction: Reduction = "mean",
+        functional: bool = False,
     ) -> None:
-        super().__init__(reward, reduction=reduction)
+        super().__init__(reward, reduction=reduction, functional=functional)
         if alpha is None:
             alpha = 100.0 if reward.actions.discrete else 1.0
         if not alpha >= 0:

@@ -92,6 +92,7 @@ class ObservationScaler(nn.Module):
         self.offset.copy_(offset)
         self.scale.copy_(half_width.reciprocal())
         self.fitted.fill_(True)
+        self._known_fitted = True
         return self
 
     def forward(self, observation: Tensor) -> Tensor:

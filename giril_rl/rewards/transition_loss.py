@@ -8,12 +8,13 @@ from typing import Literal, get_args
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import TensorDictModuleBase, dispatch
+from tensordict.nn import TensorDictModuleBase, TensorDictParams, dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.objectives import LossModule
 
 from giril_rl.errors import UserError
+from giril_rl.rewards.functional import hold_reward, reward_parameters
 
 Reduction = Literal["mean", "sum", "none"]
 
@@ -28,6 +29,9 @@ class TransitionLoss(LossModule):
         reward: the module to train, which reads observation, action and next observation; its
             parameters are this loss's parameters.
         reduction: ``"mean"``, ``"sum"`` or ``"none"`` over transitions.
+        functional: keep the parameters and buffers apart from the module, as ``reward_params``, as
+            TorchRL's own losses do. By default they stay in the module, so that the names in the
+            loss's ``state_dict`` are the module's, its noise generator's included.
 
     Raises:
         UserError: for an unknown reduction.
@@ -64,15 +68,29 @@ class TransitionLoss(LossModule):
     default_keys = _AcceptedKeys
     tensor_keys: _AcceptedKeys
     reward: TensorDictModuleBase
+    reward_params: TensorDictParams
+    target_reward_params: TensorDictParams
 
-    def __init__(self, reward: TensorDictModuleBase, *, reduction: Reduction = "mean") -> None:
+    def __init__(
+        self,
+        reward: TensorDictModuleBase,
+        *,
+        reduction: Reduction = "mean",
+        functional: bool = False,
+    ) -> None:
         super().__init__()
         if reduction not in get_args(Reduction):
             raise UserError(f"reduction={reduction!r} is unknown: choose mean, sum or none.")
-        self.reward = reward
+        hold_reward(self, reward, functional)
+        self._functional = functional
         self.reduction = reduction
         observation, action, following = reward.in_keys
         self.set_keys(observation=observation, action=action, next_observation=following)
+
+    @property
+    def functional(self) -> bool:
+        """Whether the parameters are kept apart from the module, under ``reward_params``."""
+        return self._functional
 
     @property
     def in_keys(self) -> list[NestedKey]:
@@ -98,7 +116,8 @@ class TransitionLoss(LossModule):
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """The terms, reduced; with ``reduction="none"`` of the batch's shape."""
-        terms = self.terms(*(tensordict.get(key) for key in self.in_keys))
+        with reward_parameters(self):
+            terms = self.terms(*(tensordict.get(key) for key in self.in_keys))
         reduced = {
             name: self._reduce_loss(term, tensordict=tensordict)
             for name, term in zip(self.out_keys, terms, strict=True)

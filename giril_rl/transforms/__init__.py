@@ -4,11 +4,15 @@ from giril_rl.transforms.batch_mean import BatchMeanReward
 from giril_rl.transforms.intrinsic import IntrinsicReward
 from giril_rl.transforms.running import discounted_filter, running_moments
 from giril_rl.transforms.scaling import ReturnScaling
+from giril_rl.transforms.sync import RewardWeightSyncScheme
+from giril_rl.transforms.weighted import WeightedReward
 
 __all__ = [
     "BatchMeanReward",
     "IntrinsicReward",
     "ReturnScaling",
+    "RewardWeightSyncScheme",
+    "WeightedReward",
     "discounted_filter",
     "running_moments",
 ]
