@@ -157,22 +157,23 @@ class ReturnScaling(Transform):
         return following.set(self.reward_key, _from_steps(scaled, reward, time_dim))
 
     def _learn(self, steps: Tensor, done: Tensor | None) -> Tensor:
-        envs = steps.shape[0]
-        if self.running_return.numel() == 0:
-            self.running_return = self.running_return.new_zeros(envs)
-        if self.running_return.shape[0] != envs:
+        envs, before = steps.shape[0], self.running_return
+        first = before.numel() == 0
+        if first:
+            before = before.new_zeros(envs)
+        if before.shape[0] != envs:
             raise UserError(
-                f"the running returns are those of {self.running_return.shape[0]} environments "
+                f"the running returns are those of {before.shape[0]} environments "
                 f"and the batch has {envs}: give whole batches with time along "
                 f"time_dim={self.time_dim}, or call .freeze() to scale without learning."
             )
-        returns, carry = discounted_filter(steps, done, self.running_return, self.gamma)
+        returns, carry = discounted_filter(steps, done, before, self.gamma)
         count, mean, m2 = running_moments(returns, self.count, self.mean, self.m2)
+        if first or steps.shape[1]:
+            # Replaced, not filled: torch.compile (2.13) loses what these buffers are filled with.
+            self.running_return = carry.clone()
         if steps.shape[1]:
-            self.running_return.copy_(carry)
-            self.count.copy_(count[-1])
-            self.mean.copy_(mean[-1])
-            self.m2.copy_(m2[-1])
+            self.count, self.mean, self.m2 = (x[-1].clone() for x in (count, mean, m2))
         return (m2 / count + self.eps).sqrt()
 
     def _reset(

@@ -65,8 +65,8 @@ class WeightedReward(Transform):
         following = tensordict.get("next", None)
         if following is None:
             raise UserError("the batch has no ('next', ...) entries: give whole transitions.")
-        # Set again, because a lazy stack hands out a copy.
-        return tensordict.set("next", self._sum(following))
+        self._sum(following)
+        return tensordict
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         return self._sum(next_tensordict)
