@@ -18,6 +18,7 @@ from giril_rl.rewards.discriminator import DiscriminatorReward, DiscriminatorSca
 from giril_rl.rewards.discriminator_loss import DiscriminatorLoss
 from giril_rl.rewards.equations import blend_action, reconstruction_error
 from giril_rl.rewards.factored import factored_error
+from giril_rl.rewards.fitting import fit
 from giril_rl.rewards.generative import GenerativeReward, Prior
 from giril_rl.rewards.generative_loss import (
     GenerativeRewardLoss,
@@ -57,6 +58,7 @@ __all__ = [
     "discriminator_loss",
     "factored_error",
     "feature_error",
+    "fit",
     "gaussian_kl",
     "gradient_penalty",
     "reconstruction_error",

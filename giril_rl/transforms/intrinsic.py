@@ -29,7 +29,9 @@ class IntrinsicReward(Transform):
     that expects one; it must then not be among a policy's ``in_keys``.
 
     In an environment, put it outside a :class:`~torchrl.envs.ParallelEnv`: workers hold copies of
-    the module, which later training of the original does not reach.
+    the module, which later training of the original does not reach. Copies in the environments of
+    a multi-process collector get new weights by
+    :class:`~giril_rl.transforms.RewardWeightSyncScheme`.
 
     Args:
         module: reads ``(s, a, s')``, e.g. ``"observation"``, ``"action"`` and

@@ -7,10 +7,11 @@ from functools import partial
 import cloudpickle
 import pytest
 import torch
+from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.collectors import Collector, MultiAsyncCollector, MultiSyncCollector
-from torchrl.data import Bounded, LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.data import Bounded, Categorical, LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import Compose, GymEnv, SerialEnv, TransformedEnv
 from torchrl.weight_update import SharedMemWeightSyncScheme
 
@@ -177,3 +178,20 @@ def test_scheme_refuses_what_has_no_weights_or_other_ones():
     with pytest.raises(UserError, match="build both in the same way"):
         scheme.strategy.apply_weights(twin, weights)
     assert scheme.__getstate__()["_source"] is None
+
+
+def test_what_was_computed_from_old_weights_is_computed_anew():
+    """A reward of frames keeps a table of its decoder's weights; sent ones must replace it."""
+    one, other = (GenerativeReward.for_pixels(Categorical(3), seed=seed) for seed in (0, 1))
+    frames = torch.randint(256, (2, 3, 4, 84, 84), dtype=torch.uint8)
+    batch = {"observation": frames[0], "action": torch.tensor([0, 1, 2])}
+    batch = TensorDict({**batch, "next": {"observation": frames[1]}}, [3])
+
+    def rewards(module):
+        with torch.no_grad():
+            return module.eval()(batch)["next", "intrinsic_reward"].clone()
+
+    assert not torch.allclose(rewards(one), rewards(other))
+    strategy = RewardWeightSyncScheme(other).strategy
+    strategy.apply_weights(one, strategy.extract_weights(other))
+    assert torch.equal(rewards(one), rewards(other))

@@ -1,0 +1,72 @@
+"""Fitting a reward to a demonstration, in one call."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDictBase
+
+from giril_rl.errors import UserError
+from giril_rl.rewards.transition_loss import TransitionLoss
+
+
+def fit(
+    loss: TransitionLoss,
+    demonstration: TensorDictBase,
+    *,
+    steps: int = 50_000,
+    batch: int = 32,
+    lr: float = 3e-5,
+    seed: int = 0,
+) -> dict[str, float]:
+    """Fits the reward's scaler, then minimises its loss by Adam; the defaults are the paper's.
+
+    The recipes' training does the same with checkpoints and logs; this is for other projects.
+
+    Args:
+        loss: the reward's loss; its module is trained in place and left in eval mode.
+        demonstration: transitions of any leading shape, with the loss's ``in_keys``.
+        steps: gradient steps.
+        batch: transitions in each, drawn with replacement.
+        lr: Adam's step size.
+        seed: seeds minibatches and the loss's noise. The global random state is left as it was.
+
+    Returns:
+        The loss's terms at the last step.
+
+    Raises:
+        UserError: for a loss that needs the policy's transitions as well, or no transitions or
+            steps.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> from torchrl.data import Bounded
+        >>> from giril_rl.rewards import GenerativeReward, GenerativeRewardLoss
+        >>> s, a = torch.randn(50, 2), torch.rand(50, 1)
+        >>> demo = TensorDict({"observation": s, "action": a, "next": {"observation": s + a}}, [50])
+        >>> reward = GenerativeReward.for_vectors(2, Bounded(-1, 1, shape=(1,)))
+        >>> sorted(fit(GenerativeRewardLoss(reward), demo, steps=3))
+        ['loss_action', 'loss_kl', 'loss_reconstruction']
+    """
+    if not isinstance(loss, TransitionLoss):
+        raise UserError(
+            f"{type(loss).__name__} needs the policy's transitions as well: train it beside the "
+            "policy, not before."
+        )
+    count = demonstration.batch_size.numel()
+    if count < 1 or steps < 1 or batch < 1:
+        raise UserError(
+            f"{count} transitions, steps={steps} and batch={batch}: give at least one of each."
+        )
+    data = demonstration.select(*loss.in_keys).reshape(-1)
+    loss.reward.scaler.fit(data.get(loss.in_keys[0]))
+    optimizer = torch.optim.Adam(loss.parameters(), lr=lr)
+    loss.train()
+    with torch.random.fork_rng(), torch.enable_grad():
+        torch.manual_seed(seed)
+        for _ in range(steps):
+            terms = loss(data[torch.randint(len(data), (batch,))])
+            optimizer.zero_grad()
+            torch.stack([term.sum() for term in terms.values()]).sum().backward()
+            optimizer.step()
+    loss.eval()
+    return {str(key): term.mean().item() for key, term in terms.items()}
