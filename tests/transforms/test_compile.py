@@ -21,7 +21,7 @@ def make(reward):
     return Compose(IntrinsicReward(reward), BatchMeanReward(), ReturnScaling(), weighted)
 
 
-@pytest.mark.parametrize("backend", ["eager", "inductor"])
+@pytest.mark.parametrize("backend", ["aot_eager", pytest.param("inductor", marks=pytest.mark.slow)])
 def test_one_graph_with_the_same_numbers(backend):
     """The whole stack is captured without a break, and goes on learning from batch to batch."""
     torch._dynamo.reset()
