@@ -6,7 +6,9 @@ from giril_rl.errors import UserError
 from giril_rl.networks.space_to_depth import SpaceToDepthConv
 
 
-@pytest.mark.parametrize(("channels", "kernel", "stride"), [(4, 8, 4), (1, 4, 2), (3, 6, 3), (2, 4, 1)])
+@pytest.mark.parametrize(
+    ("channels", "kernel", "stride"), [(4, 8, 4), (1, 4, 2), (3, 6, 3), (2, 4, 1)]
+)
 def test_values_and_gradients_are_those_of_the_plain_convolution(channels, kernel, stride):
     conv = SpaceToDepthConv(channels, 5, kernel, stride=stride).double()
     frames = torch.randint(0, 256, (3, channels, 84, 84), dtype=torch.uint8)
