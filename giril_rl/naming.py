@@ -13,8 +13,8 @@ from typing import Any
 from giril_rl.configs import ExpertRunConfig
 
 _OWN_PLACE = {"task", "task.name", "seed"}
-NO_EFFECT = frozenset({"out", "root", "logger", "threads"})
-"""Keys that change where and how fast a run is made, not its numbers."""
+NO_EFFECT = frozenset({"out", "root", "logger", "threads", "device"})
+"""Keys that change where and how fast a run is made, not its numbers (but for their rounding)."""
 _LONGEST = 80
 ADDED = {
     "task.expert_steps": 5_000_000,
@@ -25,7 +25,6 @@ ADDED = {
     "ppo.clip_value": False,
     "demo.lives": "first",
     "clip_reward": False,
-    "device": "cpu",
 }
 """Keys that earlier runs did not have, with the value that they behaved by."""
 
@@ -58,8 +57,8 @@ def without_added(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]
 def config_hash(config: Any) -> str:
     """Twelve hex digits of the configuration, less what cannot change a result.
 
-    sha256 of the resolved configuration as JSON with sorted keys, without ``out``, ``root``,
-    ``logger`` and ``threads``, and without later keys at the value they had before they existed.
+    sha256 of the resolved configuration as JSON with sorted keys, without :data:`NO_EFFECT` and
+    without later keys at the value they had before they existed.
 
     Args:
         config: an instance of a recipe's ``Config``.

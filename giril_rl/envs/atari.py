@@ -29,8 +29,8 @@ class AtariEnv(BatchedEnv):
 
     A life begins, as with the wrappers of OpenAI baselines, with a step without action (but for a
     game's first life) and, in games that have the button, the actions 1 (fire) and 2. The stack is
-    then empty, black, but for the latest frame. What these steps score counts in whole games and is
-    lost to the learner of single lives.
+    then empty, black, but for the latest frame. What these steps score counts in whole games, but
+    for a game's first opening; to the learner of single lives it is lost.
 
     Observations are uint8 ``(num_envs, 4, 84, 84)``, the latest frame last; actions are integers.
     ``("next", "game_over")`` tells the end of a game from that of a life.

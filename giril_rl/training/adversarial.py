@@ -11,6 +11,7 @@ from torch import Tensor
 from giril_rl.configs import AdversarialConfig
 from giril_rl.rewards.bottleneck_loss import BottleneckLoss
 from giril_rl.rewards.discriminator_loss import DiscriminatorLoss
+from giril_rl.training.randomness import restore_rng, rng_state, seeded
 from giril_rl.training.traced import TracedGradients
 
 
@@ -51,7 +52,9 @@ class AdversarialLearner:
         device = self.gradients.parameters[0].device
         self._expert = [expert.get(key).contiguous().to(device) for key in self._pair_keys]
         self.optimizer = torch.optim.Adam(self.gradients.parameters, lr=cfg.lr, fused=True)
-        self._rng = torch.Generator().manual_seed(seed).get_state()
+        self._device = device
+        with seeded(seed, device):
+            self._rng = rng_state(device)
 
     def update(self, batch: TensorDictBase) -> dict[str, float]:
         """Trains the discriminator on a batch ``(num_envs, time)`` of which it reads the pairs.
@@ -62,10 +65,10 @@ class AdversarialLearner:
         dims = batch.ndim
         policy = [batch.get(key).flatten(0, dims - 1) for key in self._pair_keys]
         self.loss.reward.observe(policy[0])
-        with torch.random.fork_rng(devices=[]):
-            torch.set_rng_state(self._rng)
+        with seeded(0, self._device):
+            restore_rng(self._rng)
             logs = [self._step(policy) for _ in range(self.cfg.updates)]
-            self._rng = torch.get_rng_state()
+            self._rng = rng_state(self._device)
         metrics = {
             f"discriminator/{name}": torch.stack([log[name] for log in logs]).mean().item()
             for name in logs[0]

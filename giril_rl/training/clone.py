@@ -18,6 +18,7 @@ from giril_rl.networks.agents import Agent
 from giril_rl.networks.normalise import RunningNormaliser
 from giril_rl.networks.policy import NORMALISED
 from giril_rl.progress import progress
+from giril_rl.rewards.chunks import PIXELS_AT_ONCE
 from giril_rl.training.interrupt import Interrupt, Interrupted
 from giril_rl.training.ppo import Trained
 
@@ -103,7 +104,7 @@ def clone_behaviour(
                 optimizer.step()
             step += block
             with torch.no_grad():
-                losses = {name: loss(pairs)["loss_bc"].item() for name, pairs in sets.items()}
+                losses = {name: _mean_loss(loss, pairs) for name, pairs in sets.items()}
             if cfg.stop == "held_out" and losses["held_out"] < best["loss"]:
                 weights = {k: v.clone() for k, v in agent.actor.state_dict().items()}
                 best = {"step": step, "loss": losses["held_out"], "actor": weights}
@@ -167,6 +168,14 @@ def _pairs(agent: Agent, data: TensorDictBase) -> TensorDict:
     data = data.to(agent.device)
     normalised = agent.normaliser(data.get("observation"))
     return TensorDict({NORMALISED: normalised, "action": data.get("action")}, data.shape)
+
+
+def _mean_loss(loss: BCLoss, pairs: TensorDict) -> float:
+    if pairs.get(NORMALISED).ndim == 2:
+        return loss(pairs)["loss_bc"].item()
+    # Frames would take gigabytes at once.
+    parts = [(len(part), loss(part)["loss_bc"].item()) for part in pairs.split(PIXELS_AT_ONCE)]
+    return sum(size * value for size, value in parts) / len(pairs)
 
 
 def _minibatch(pairs: TensorDict, size: int, generator: torch.Generator) -> TensorDict:

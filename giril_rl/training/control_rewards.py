@@ -79,6 +79,8 @@ def moments(reward: TensorDictModuleBase, demo: Demonstration) -> tuple[float, f
         (3.0, 0.0)
     """
     view = demo.transitions.select(*reward.in_keys)
-    device = next((tensor.device for tensor in reward.state_dict().values()), None)
-    values = reward(view if device is None else view.to(device)).get(reward.out_keys[0]).double()
+    weight = next(reward.parameters(), None)
+    values = (
+        reward(view if weight is None else view.to(weight.device)).get(reward.out_keys[0]).double()
+    )
     return values.mean().item(), values.var(correction=0).item()

@@ -13,6 +13,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from giril_rl.configs import TaskConfig
 from giril_rl.envs import for_scores, make_env
+from giril_rl.training.randomness import seeded
 
 
 class Player(Protocol):
@@ -79,8 +80,8 @@ def evaluate(
     returns = torch.zeros(episodes, dtype=torch.float64)
     lengths = torch.zeros(episodes, dtype=torch.int64)
     playing = torch.ones(episodes, dtype=torch.bool)
-    with torch.random.fork_rng(devices=[]), torch.no_grad(), set_exploration_type(mode):
-        torch.default_generator.manual_seed(seed)
+    device = getattr(agent, "device", torch.device("cpu"))
+    with seeded(seed, device), torch.no_grad(), set_exploration_type(mode):
         tensordict = env.reset()
         while playing.any():
             tensordict, following = env.step_and_maybe_reset(policy(tensordict))

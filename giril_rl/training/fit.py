@@ -14,7 +14,7 @@ from giril_rl.configs import FitConfig
 from giril_rl.progress import progress
 from giril_rl.rewards.chunks import PIXELS_AT_ONCE
 from giril_rl.training.interrupt import Interrupt, Interrupted
-from giril_rl.training.randomness import restore_rng, rng_state
+from giril_rl.training.randomness import restore_rng, rng_state, seeded
 from giril_rl.training.traced import TracedGradients
 
 if TYPE_CHECKING:
@@ -107,8 +107,7 @@ def _evaluate(loss: nn.Module, sets: dict[str, TensorDictBase | None]) -> dict[s
     for name, data in sets.items():
         if data is None or not len(data):
             continue
-        with torch.no_grad(), torch.random.fork_rng(devices=[]):
-            torch.default_generator.manual_seed(0)
+        with torch.no_grad(), seeded(0, data.get("observation").device):
             frames = data.get("observation").ndim > 2
             for key, value in loss(data[:PIXELS_AT_ONCE] if frames else data).items():
                 values[f"fit/{name}/{str(key).removeprefix('loss_')}"] = value.item()

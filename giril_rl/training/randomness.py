@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 import torch
 from torch import Tensor
 
@@ -19,6 +22,29 @@ def rng_state(device: torch.device) -> dict[str, Tensor]:
     if device.type == "cuda":
         state["cuda"] = torch.cuda.get_rng_state(device)
     return state
+
+
+@contextmanager
+def seeded(seed: int, device: torch.device) -> Iterator[None]:
+    """Seeds the generators of the CPU and of ``device``, and puts them back afterwards.
+
+    Examples:
+        >>> state = torch.get_rng_state()
+        >>> with seeded(3, torch.device("cpu")):
+        ...     first = torch.rand(1)
+        >>> with seeded(3, torch.device("cpu")):
+        ...     bool(torch.rand(1) == first)
+        True
+        >>> torch.equal(torch.get_rng_state(), state)
+        True
+    """
+    on_gpu = device.type == "cuda"
+    with torch.random.fork_rng(devices=[device] if on_gpu else []):
+        torch.default_generator.manual_seed(seed)
+        if on_gpu:
+            with torch.cuda.device(device):
+                torch.cuda.manual_seed(seed)
+        yield
 
 
 def restore_rng(state: dict[str, Tensor]) -> None:
