@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import torch
 from torchrl.envs import EnvBase
 
 from giril_rl.networks.pixel_policy import PixelActorCritic
 from giril_rl.networks.policy import ActorCritic
-from giril_rl.pretrained import made_class
+from giril_rl.pretrained import made_class, plain
 
 Agent = ActorCritic | PixelActorCritic
 """PPO's policy and value network, of vectors or of pixels; both have the same methods."""
@@ -31,10 +32,10 @@ def agent_for(env: EnvBase, *, hidden: Sequence[int], normalise: bool) -> Agent:
         >>> type(agent_for(env, hidden=(16,), normalise=True)).__name__
         'ActorCritic'
     """
-    observation = env.observation_spec["observation"]
-    if observation.dtype == torch.uint8:
-        return PixelActorCritic(env.action_spec.space.n, observation.shape[-3])
-    return ActorCritic(observation.shape[-1], env.action_spec, hidden=hidden, normalise=normalise)
+    kind, needs = _needed(env)
+    if kind is PixelActorCritic:
+        return kind(**needs)
+    return kind(**needs, hidden=hidden, normalise=normalise)
 
 
 def load_agent_from(folder: Path | str) -> Agent:
@@ -67,9 +68,22 @@ def fits(agent: Agent, env: EnvBase) -> bool:
         >>> fits(PixelActorCritic(2), env)
         False
     """
-    like = agent_for(env, hidden=(1,), normalise=False)
-    return type(like) is type(agent) and all(
-        agent.made_with.get(name) == value
-        for name, value in like.made_with.items()
-        if name not in ("hidden", "normalise")
+    kind, needs = _needed(env)
+    made_with = agent.made_with
+    return type(agent) is kind and all(
+        made_with.get(name) == plain(value) for name, value in needs.items()
     )
+
+
+def _needed(env: EnvBase) -> tuple[type[Any], dict[str, Any]]:
+    """The class of agent for an environment, and the arguments that the environment decides."""
+    observation = env.observation_spec["observation"]
+    if observation.dtype == torch.uint8:
+        return PixelActorCritic, {
+            "actions": int(env.action_spec.space.n),
+            "channels": observation.shape[-3],
+        }
+    return ActorCritic, {
+        "observation_size": observation.shape[-1],
+        "action_spec": env.action_spec,
+    }
