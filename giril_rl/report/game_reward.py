@@ -14,8 +14,6 @@ from giril_rl.report.drawing import new_figure, save, thousands
 from giril_rl.report.game import Game
 from giril_rl.report.style import BLACK, BLUE, GREY, RED
 
-_AT_ONCE = 256
-
 
 @torch.no_grad()
 def rewards_of(reward: TensorDictModuleBase, transitions: TensorDictBase) -> np.ndarray:
@@ -28,12 +26,7 @@ def rewards_of(reward: TensorDictModuleBase, transitions: TensorDictBase) -> np.
     Returns:
         float32 [N].
     """
-    keys = list(reward.in_keys)
-    parts = [
-        reward(part.select(*keys)).get(reward.out_keys[0]).flatten()
-        for part in transitions.split(_AT_ONCE)
-    ]
-    return torch.cat(parts).numpy()
+    return reward(transitions.select(*reward.in_keys)).get(reward.out_keys[0]).flatten().numpy()
 
 
 def draw_game(

@@ -34,5 +34,23 @@ def in_chunks(
     return torch.cat([function(*part) for part in parts]).reshape(batch)
 
 
+def per_transition(
+    function: Callable[..., Tensor], inputs: tuple[Tensor, ...], event_dims: int
+) -> Tensor:
+    """``function(*inputs)``, one number per transition; of frames :data:`PIXELS_AT_ONCE` at a time.
+
+    Args:
+        function: maps tensors of any leading shape to one number for each element of it.
+        inputs: an observation ``(*batch, ...)`` first, then what else belongs to the transitions.
+        event_dims: dimensions of one observation: 1 for vectors, 3 for frames.
+
+    Examples:
+        >>> per_transition(lambda x: x.sum(-1), (torch.ones(2, 3, 5),), event_dims=1).shape
+        torch.Size([2, 3])
+    """
+    batch = inputs[0].shape[: inputs[0].ndim - event_dims]
+    return in_chunks(function, inputs, batch, PIXELS_AT_ONCE if event_dims == 3 else None)
+
+
 PIXELS_AT_ONCE = 256
 """Transitions of frames that a network takes at a time."""

@@ -9,7 +9,7 @@ from tensordict.nn import TensorDictModuleBase, dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor
 
-from giril_rl.rewards.chunks import PIXELS_AT_ONCE, in_chunks
+from giril_rl.rewards.chunks import per_transition
 from giril_rl.rewards.equations import reconstruction_error
 from giril_rl.rewards.keys import REWARD_KEYS, check_keys
 from giril_rl.rewards.pixel_scaler import PixelScaler
@@ -63,9 +63,7 @@ class CopyReward(TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes each transition's reward."""
         pair = tuple(tensordict.get(key) for key in self.in_keys)
-        batch = pair[0].shape[: pair[0].ndim - self.scaler.event_dims]
-        size = PIXELS_AT_ONCE if self.scaler.event_dims == 3 else None
-        error = in_chunks(self._error, pair, batch, size)
+        error = per_transition(self._error, pair, self.scaler.event_dims)
         return tensordict.set(self.out_keys[0], self.scale * error.unsqueeze(-1))
 
     def _error(self, observation: Tensor, following: Tensor) -> Tensor:

@@ -16,7 +16,7 @@ from giril_rl.networks.pixels import ForwardModel, InverseModel, PixelFeatures
 from giril_rl.networks.vectors import mlp
 from giril_rl.pretrained import Pretrained, remembered
 from giril_rl.rewards.actions import ActionEncoder
-from giril_rl.rewards.chunks import PIXELS_AT_ONCE, in_chunks
+from giril_rl.rewards.chunks import per_transition
 from giril_rl.rewards.keys import REWARD_KEYS, TRANSITION_KEYS, check_keys
 from giril_rl.rewards.pixel_scaler import PixelScaler
 from giril_rl.rewards.scaler import ObservationScaler, ScalingRule
@@ -207,9 +207,8 @@ class CuriosityReward(Pretrained, TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes each transition's reward."""
         observation, action, following = (tensordict.get(key) for key in self.in_keys)
-        batch = observation.shape[: observation.ndim - self.scaler.event_dims]
-        size = PIXELS_AT_ONCE if self.scaler.event_dims == 3 else None
-        error = in_chunks(self._error, (observation, action, following), batch, size)
+        transitions = (observation, action, following)
+        error = per_transition(self._error, transitions, self.scaler.event_dims)
         return tensordict.set(self.out_keys[0], self.scale * error.unsqueeze(-1))
 
     def _error(self, observation: Tensor, action: Tensor, following: Tensor) -> Tensor:

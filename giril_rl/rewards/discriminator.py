@@ -20,7 +20,7 @@ from giril_rl.networks.vectors import mlp
 from giril_rl.pretrained import Pretrained, remembered
 from giril_rl.rewards.actions import ActionEncoder
 from giril_rl.rewards.adversarial import RewardForm, adversarial_reward
-from giril_rl.rewards.chunks import PIXELS_AT_ONCE, in_chunks
+from giril_rl.rewards.chunks import per_transition
 from giril_rl.rewards.keys import PAIR_KEYS, REWARD_KEYS, check_keys
 from giril_rl.rewards.pixel_scaler import PixelScaler
 from giril_rl.rewards.scaler import ObservationScaler
@@ -181,8 +181,7 @@ class DiscriminatorReward(Pretrained, TensorDictModuleBase):
         """Writes each transition's reward."""
         pair = tuple(tensordict.get(key) for key in self.in_keys)
         dims = 3 if isinstance(self.scaler, PixelScaler) else 1
-        size = PIXELS_AT_ONCE if dims == 3 else None
-        reward = in_chunks(self._value, pair, pair[0].shape[: pair[0].ndim - dims], size)
+        reward = per_transition(self._value, pair, dims)
         return tensordict.set(self.out_keys[0], reward.unsqueeze(-1))
 
     def _value(self, observation: Tensor, action: Tensor) -> Tensor:

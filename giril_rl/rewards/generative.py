@@ -20,7 +20,7 @@ from giril_rl.networks.vectors import mlp
 from giril_rl.pretrained import Pretrained, remembered
 from giril_rl.rewards.action_table import ActionTable
 from giril_rl.rewards.actions import ActionEncoder
-from giril_rl.rewards.chunks import PIXELS_AT_ONCE, in_chunks
+from giril_rl.rewards.chunks import per_transition
 from giril_rl.rewards.equations import blend_action, reconstruction_error
 from giril_rl.rewards.factored import factored_error
 from giril_rl.rewards.keys import REWARD_KEYS, TRANSITION_KEYS, check_keys
@@ -258,9 +258,8 @@ class GenerativeReward(Pretrained, TensorDictModuleBase):
             clamp = self.scaler.clamp
             error = factored_error(table, weight, index, observation, following, clamp=clamp)
         else:
-            batch = observation.shape[: observation.ndim - self.scaler.event_dims]
-            size = PIXELS_AT_ONCE if self.scaler.event_dims == 3 else None
-            error = in_chunks(self._error, (observation, action, following), batch, size)
+            transitions = (observation, action, following)
+            error = per_transition(self._error, transitions, self.scaler.event_dims)
         return tensordict.set(self.out_keys[0], self.scale * error.unsqueeze(-1))
 
     def _error(self, observation: Tensor, action: Tensor, following: Tensor) -> Tensor:

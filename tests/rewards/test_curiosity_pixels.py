@@ -6,7 +6,7 @@ import torch.nn.functional as F
 from pixel_data import ACTIONS, convolved, run_in, scaled, transitions
 from torchrl.data import Categorical
 
-from giril_rl.rewards import CuriosityReward, CuriosityRewardLoss, curiosity
+from giril_rl.rewards import CuriosityReward, CuriosityRewardLoss, chunks
 
 
 def model(**kwargs):
@@ -62,7 +62,7 @@ def test_many_transitions_are_taken_some_at_a_time(monkeypatch):
     reward, data = model().eval(), transitions(2, 3)
     with torch.no_grad():
         whole = reward(data.clone())["next", "intrinsic_reward"]
-        monkeypatch.setattr(curiosity, "PIXELS_AT_ONCE", 4)
+        monkeypatch.setattr(chunks, "PIXELS_AT_ONCE", 4)
         sizes = []
         reward.features.register_forward_hook(lambda _, inputs, out: sizes.append(len(out)))
         parts = reward(data.clone())["next", "intrinsic_reward"]

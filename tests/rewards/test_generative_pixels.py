@@ -16,7 +16,7 @@ from giril_rl.rewards import (
     GenerativeReward,
     GenerativeRewardLoss,
     PixelScaler,
-    generative,
+    chunks,
 )
 
 
@@ -76,7 +76,7 @@ def test_the_literal_way_takes_some_transitions_at_a_time(beta, monkeypatch):
     sizes = []
     reward.decoder.register_forward_hook(lambda _, inputs, out: sizes.append(len(out)))
     whole = literal(copy.deepcopy(reward), data)
-    monkeypatch.setattr(generative, "PIXELS_AT_ONCE", 4)
+    monkeypatch.setattr(chunks, "PIXELS_AT_ONCE", 4)
     sizes.clear()
     parts = literal(reward, data)
     assert sizes == [4, 2]
