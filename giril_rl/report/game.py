@@ -13,6 +13,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 from giril_rl.configs import TaskConfig
 from giril_rl.envs import AtariEnv, make_env
 from giril_rl.training.evaluate import Player
+from giril_rl.training.randomness import seeded
 
 MOST_STEPS = 2_000
 
@@ -69,11 +70,10 @@ def play_game(agent: Player, task: TaskConfig, *, seed: int, most: int = MOST_ST
     played: list[TensorDictBase] = []
     score, lives = [], []
     with (
-        torch.random.fork_rng(devices=[]),
+        seeded(seed, torch.device("cpu")),
         torch.no_grad(),
         set_exploration_type(ExplorationType.RANDOM),
     ):
-        torch.default_generator.manual_seed(seed)
         batch = env.reset()
         first_lives, over = int(env.lives[0]), False
         while not over and len(played) < most:

@@ -10,6 +10,7 @@ from giril_rl.configs import PPOConfig, TaskConfig
 from giril_rl.envs import BatchedEnv, make_env
 from giril_rl.errors import UserError
 from giril_rl.networks.agents import Agent, agent_for, fits, load_agent_from
+from giril_rl.training.randomness import seeded
 
 POLICY = "policy"
 """The folder of a run that holds its policy, see :class:`giril_rl.pretrained.Pretrained`."""
@@ -24,8 +25,7 @@ def make_agent(env: BatchedEnv, cfg: PPOConfig, seed: int) -> Agent:
         >>> make_agent(env, PPOConfig(), seed=0).critic(torch.zeros(1, 4)).shape
         torch.Size([1, 1])
     """
-    with torch.random.fork_rng(devices=[]):
-        torch.default_generator.manual_seed(seed)
+    with seeded(seed, torch.device("cpu")):
         return agent_for(env, hidden=cfg.hidden, normalise=cfg.normalise_observations)
 
 

@@ -54,12 +54,16 @@ def train_expert(cfg: ExpertRunConfig, folder: Path) -> dict[str, Any]:
         if run.result is not None:
             return run.result
         env = make_env(cfg.task, cfg.ppo.num_envs, cfg.seed)
-        scaling = return_scaling(cfg.scaling, cfg.ppo.gamma)
         agent = make_agent(env, cfg.ppo, cfg.seed).to(cfg.device)
+        relabel = (
+            [SignTransform(REWARD)]
+            if cfg.clip_reward
+            else return_scaling(cfg.scaling, cfg.ppo.gamma)
+        )
         trained = train_ppo(
             env,
             agent,
-            Compose(*([SignTransform(REWARD)] if cfg.clip_reward else scaling)),
+            Compose(*relabel),
             cfg.ppo,
             steps=cfg.steps,
             seed=cfg.seed,

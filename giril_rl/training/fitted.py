@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
-from giril_rl.configs import DemoConfig, ExpertConfig, RunConfig
+from giril_rl.configs import DemoConfig, ExpertConfig, RunConfig, TaskConfig
 from giril_rl.demos import Demonstration
 from giril_rl.naming import config_hash
 from giril_rl.training.expert import demonstration_place, expert_settings
-from giril_rl.training.finished import read_config, read_part, read_result, read_settings
+from giril_rl.training.finished import read_config, read_part, read_result
 
 
 def find_demonstration(folder: Path) -> Demonstration | None:
@@ -28,18 +29,17 @@ def find_demonstration(folder: Path) -> Demonstration | None:
     """
     config, result = read_config(folder), read_result(folder)
     demo = read_part(folder, config, "demo", DemoConfig)
-    for place in _places(folder, demo):
+    for place in _places(folder, config, demo):
         if (place / "card.json").is_file():
             found = Demonstration.load(place)
             return found if len(found) == result.get("demo_transitions") else None
     return None
 
 
-def _places(folder: Path, demo: DemoConfig) -> list[Path]:
+def _places(folder: Path, config: dict[str, Any], demo: DemoConfig) -> list[Path]:
     if demo.path is not None:
         return [Path(demo.path)]
-    config = read_config(folder)
-    task, _ = read_settings(folder)
+    task = read_part(folder, config, "task", TaskConfig)
     expert = read_part(folder, config, "expert", ExpertConfig)
     if expert.path is None:
         made_by = config_hash(expert_settings(RunConfig(task=task), expert))
