@@ -17,6 +17,8 @@ from giril_rl.errors import UserError
 Episode = Literal["life", "game"]
 
 STACK = 4
+RESEED_EVERY = 64
+"""Games that one seed is for: seeding takes ten times as long as the rest of a reset."""
 
 
 class AtariEnv(BatchedEnv):
@@ -34,6 +36,9 @@ class AtariEnv(BatchedEnv):
 
     Observations are uint8 ``(num_envs, 4, 84, 84)``, the latest frame last; actions are integers.
     ``("next", "game_over")`` tells the end of a game from that of a life.
+
+    Each of the ``num_envs`` is seeded anew at every 64th game; games differ in the number of frames
+    without action that they begin with.
 
     Args:
         game: the ROM's name in ale-py, such as ``"breakout"``.
@@ -142,10 +147,15 @@ class AtariEnv(BatchedEnv):
     def _begin_games(self, indices: list[int]) -> np.ndarray:
         frames = {}
         for i in indices:
-            frames[i], self._lives[i] = self._games[i].reset(self._episode_seed(i))
-            self._episode[i] += 1
-            self._actions[i] = []
+            frames[i], self._lives[i] = self._next_game(i)
         return self._open(indices, self._opening, frames)[1]
+
+    def _next_game(self, i: int) -> tuple[np.ndarray, int]:
+        fresh = self._episode[i] % RESEED_EVERY == 0
+        shown = self._games[i].reset(self._episode_seed(i) if fresh else None)
+        self._episode[i] += 1
+        self._actions[i] = []
+        return shown
 
     def _begin_lives(self, indices: list[int]) -> tuple[np.ndarray, np.ndarray]:
         return self._open(indices, [NOOP, *self._opening], {})
@@ -210,11 +220,10 @@ class AtariEnv(BatchedEnv):
         self._last_observation = state["observation"].numpy().copy()
         actions = state["actions"].numpy()
         frames, lives = np.zeros_like(self._last_observation[:, -1]), np.zeros_like(self._lives)
-        for i, game in enumerate(self._games):
-            self._episode[i] -= 1
-            frames[i], lives[i] = game.reset(self._episode_seed(i))
-            self._episode[i] += 1
-            self._actions[i] = []
+        for i, begun in enumerate(self._episode.tolist()):
+            self._episode[i] = (begun - 1) // RESEED_EVERY * RESEED_EVERY
+            while self._episode[i] < begun:
+                frames[i], lives[i] = self._next_game(i)
         for column in actions.T:
             playing = np.flatnonzero(column >= 0).tolist()
             for i, shown in zip(

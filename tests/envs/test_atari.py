@@ -180,13 +180,44 @@ def test_a_game_is_cut_at_the_frame_cap():
     assert torch.equal(ends, batch["next", "game_over"].squeeze(-1)[0])
 
 
+@pytest.mark.parametrize("name", IDS)
+def test_a_game_begins_the_same_whatever_was_played_before(name):
+    games, shown = [AtariGame(name), AtariGame(name)], []
+    for game, steps in zip(games, (0, 120), strict=True):
+        game.reset(seed=3)
+        for step in range(steps):
+            game.play(step % len(game.meanings))
+        frames = [game.reset()[0]]
+        frames += [game.play(step % len(game.meanings)).frame for step in range(40)]
+        shown.append(np.stack(frames))
+    assert np.array_equal(*shown)
+
+
+def test_games_are_seeded_now_and_then(monkeypatch):
+    monkeypatch.setattr("giril_rl.envs.atari.RESEED_EVERY", 2)
+    seeds, begin = [], AtariGame.reset
+    monkeypatch.setattr(
+        AtariGame, "reset", lambda self, seed=None: (seeds.append(seed), begin(self, seed))[1]
+    )
+    env = AtariEnv("breakout", 1, seed=4)
+    for _ in range(5):
+        env.reset()
+    entropies = [[4, 0, 0], None, [4, 0, 2], None, [4, 0, 4]]
+    assert seeds == [
+        e and int(np.random.SeedSequence(e).generate_state(1)[0]) for e in entropies
+    ]
+
+
+@pytest.mark.parametrize("cap", [108_000, 160])
 @pytest.mark.parametrize("episode", ["life", "game"])
-def test_a_restored_env_goes_on_as_the_first_would_have(episode):
-    first = AtariEnv("breakout", 3, episode=episode, seed=2)
+def test_a_restored_env_goes_on_as_the_first_would_have(episode, cap, monkeypatch):
+    """With the lower cap many games begin, some of them seeded and some not."""
+    monkeypatch.setattr("giril_rl.envs.atari.RESEED_EVERY", 2)
+    first = AtariEnv("breakout", 3, episode=episode, seed=2, frame_cap=cap)
     play(first, 130)
     state = first.simulator_state()
     assert all(isinstance(value, (int, torch.Tensor)) for value in state.values())
-    second = AtariEnv("breakout", 3, episode=episode, seed=99)
+    second = AtariEnv("breakout", 3, episode=episode, seed=99, frame_cap=cap)
     second.restore_simulator(state)
     roots = [first._root(torch.from_numpy(first._last_observation.copy())), second.reset()]
     generator = torch.Generator().manual_seed(7)
