@@ -15,6 +15,7 @@ if TYPE_CHECKING:
         ReturnScaling,
         RewardWeightSyncScheme,
         WeightedReward,
+        check_reward,
     )
 
 __all__ = [
@@ -23,6 +24,7 @@ __all__ = [
     "ReturnScaling",
     "RewardWeightSyncScheme",
     "WeightedReward",
+    "check_reward",
 ]
 
 

@@ -39,11 +39,12 @@ def make_env(name: str) -> TransformedEnv:
 
 
 def demonstrate(env: TransformedEnv, steps: int) -> TensorDictBase:
-    """What a heuristic for Pendulum-v1 does: push along with the swing, brake at the top."""
+    """What a heuristic for Pendulum-v1 does: swing up by energy, then hold."""
 
     def act(observation: torch.Tensor) -> torch.Tensor:
         cosine, sine, speed = observation.unbind(-1)
-        push = torch.where(cosine > 0.8, -12 * sine - 2.5 * speed, 2 * torch.sign(speed))
+        missing = 15 * (1 - cosine) - speed.square() / 2  # energy, up to the balance
+        push = torch.where(cosine > 0.9, -8 * sine - 2 * speed, missing * torch.sign(speed))
         return push.clamp(-2, 2).unsqueeze(-1)
 
     policy = TensorDictModule(act, ["observation"], ["action"])

@@ -1,6 +1,7 @@
 """TorchRL transforms of rewards: the same in an environment, on a batch, in a replay buffer."""
 
 from giril_rl.transforms.batch_mean import BatchMeanReward
+from giril_rl.transforms.checking import check_reward
 from giril_rl.transforms.intrinsic import IntrinsicReward
 from giril_rl.transforms.running import discounted_filter, running_moments
 from giril_rl.transforms.scaling import ReturnScaling
@@ -13,6 +14,7 @@ __all__ = [
     "ReturnScaling",
     "RewardWeightSyncScheme",
     "WeightedReward",
+    "check_reward",
     "discounted_filter",
     "running_moments",
 ]
