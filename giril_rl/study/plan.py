@@ -109,6 +109,8 @@ class Planner:
         from giril_rl.overrides import sweep
 
         recipe, schema = self._recipe(word)
+        if _clones(schema):  # A budget of environment steps for all other groups says nothing here.
+            changes = [text for text in changes if not text.startswith("steps=")]
         own = [text.partition("=")[0] for text in changes]
         texts = [
             override_text(key, value, is_list=_holds_list(schema, key))
@@ -190,6 +192,12 @@ def _holds_list(schema: type[Any], key: str) -> bool:
     from giril_rl.schema import leaves
 
     return any(leaf.key == key and "list" in leaf.needed for leaf in leaves(schema))
+
+
+def _clones(schema: type[Any]) -> bool:
+    from giril_rl.schema import leaves
+
+    return any(leaf.key == "bc.steps" for leaf in leaves(schema))
 
 
 def _twice(spec: Spec, one: StudyRun, other: StudyRun) -> str:

@@ -77,6 +77,12 @@ def test_the_command_line_takes_the_place_of_every_groups_own(study):
     ]
 
 
+def test_a_budget_for_all_groups_leaves_cloning_alone(study):
+    groups = "groups: [{label: a, recipe: giril, steps: 16000}, {label: b, recipe: bc}]"
+    runs = plan(study(groups), "steps=8000")
+    assert {run.recipe.name: run.config.steps for run in runs} == {"giril": 8000, "bc": 0}
+
+
 def test_a_study_that_is_cut_short_has_every_row_of_the_first_seed(study):
     name = study(
         "groups: [{label: a, recipe: fake.py, seed: [0, 1]},"

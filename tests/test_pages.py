@@ -1,0 +1,158 @@
+"""All that the pages show: Python blocks run, commands are checked, YAML is read, links lead on.
+
+A page is gone through from top to bottom, in an empty folder and one namespace, after what
+``pages.py`` prepares for it. ``giril run`` and ``giril study`` are composed and validated but start
+nothing; what else ``giril`` does is done. A block that cannot run says why in the line above it:
+``<!-- not run: reason -->``.
+"""
+
+import re
+import shlex
+import subprocess
+import sys
+import tomllib
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import yaml
+
+from giril_rl.cli import main
+from giril_rl.recipe_config import config_class
+from giril_rl.recipes import Recipe
+from giril_rl.study.spec import Spec, read_spec
+
+sys.path.insert(0, str(Path(__file__).parent))
+import pages
+
+ROOT = Path(__file__).parents[1]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+NAMES = [page.relative_to(ROOT).as_posix() for page in PAGES]
+BLOCK = re.compile(r"(?:^<!-- not run: (.+) -->\n)?^```(\S*)[^\n]*\n(.*?)^```$", re.M | re.S)
+LANGUAGES = {"python", "sh", "yaml", "text", "{toctree}", "{eval-rst}", "{literalinclude}"}
+ELSEWHERE = {"ray", "pytest", "sphinx-build", "pre-commit"}  # Commands that are not ours.
+INLINE = re.compile(r"`(giril (?:run|study|cp|ls|eval|demo|report)\b[^`]*)`")
+PLACEHOLDER = re.compile(r"\b[A-Z]{2,}\b|…|\.\.\.")
+CHECKED = set()  # Commands that no file of a page's changes.
+EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+
+
+def blocks(name):
+    """Reason not to run it, language and text of each block."""
+    return BLOCK.findall((ROOT / name).read_text(encoding="utf-8"))
+
+
+def commands(text):
+    """The commands of a shell block; one with a here-document is one command of several lines."""
+    lines = iter(text.splitlines())
+    for line in lines:
+        end = re.search(r"<<'(\w+)'", line)
+        if end:
+            line = "\n".join([line, *iter(lambda: next(lines), end[1]), end[1]])
+            yield line
+        else:
+            yield from line.split(" && ")
+
+
+def first_of_each(path):
+    """A study with one run for each group: shipped ones are planned whole by a test of theirs."""
+    spec = read_spec(path)
+    groups = []
+    for group in spec.groups:
+        one = {k: v[0] if isinstance(v, list) and v else v for k, v in group.knobs.items()}
+        groups.append(replace(group, recipes=group.recipes[:1], knobs=one))
+    return Spec(spec.name, spec.title, tuple(groups))
+
+
+@pytest.fixture
+def dry(monkeypatch, tmp_path):
+    """An empty folder, where ``giril run`` and others do all but their work."""
+    done = []
+
+    def load(recipe):
+        run = SimpleNamespace(main=lambda config, out: done.append(out))
+        run.Config = config_class(recipe)
+        return run
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(Recipe, "load", load)
+    monkeypatch.setattr("giril_rl.study.command.read_spec", first_of_each)
+    monkeypatch.setattr("giril_rl.training.finished.evaluate_run", lambda *words: None)
+    monkeypatch.setattr("giril_rl.report.report.write_report", lambda runs, out: out)
+    return done
+
+
+def check(line, capsys):
+    """Does or validates one command line as it is shown."""
+    words = shlex.split(line.partition("\n")[0], comments=True)
+    if not words or words[0] in ELSEWHERE:
+        return
+    if words[0] in ("mkdir", "cat"):
+        subprocess.run(["bash", "-ec", line], check=True)
+    elif words[0] == "pip":
+        wanted = re.findall(r"\[([\w,]+)\]", line)
+        assert all(extra in EXTRAS for extra in ",".join(wanted).split(",") if extra), line
+    elif words[0] in ("python", "bash"):
+        assert (ROOT / words[1]).is_file(), line
+    else:
+        assert words[0] == "giril", f"{line}: neither ours nor known, see ELSEWHERE"
+        if words[1] == "study" and "--help" not in words:
+            words.append("--dry-run")
+        known = tuple(words)
+        if known in CHECKED:
+            return
+        if words[1] in ("run", "study") and not any(w.endswith((".py", ".yaml")) for w in words):
+            CHECKED.add(known)
+        assert main(words[1:]) == 0, f"{line}\n{capsys.readouterr().err}"
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")
+@pytest.mark.parametrize("name", NAMES)
+def test_all_that_a_page_shows_holds(name, dry, monkeypatch, capsys):
+    found = [(kind, text) for reason, kind, text in blocks(name) if not reason]
+    before, after = pages.OF.get(name, (pages.nothing, pages.nothing))
+    names = {"__name__": "page", **(before(monkeypatch, blocks(name)) or {})}
+    for kind, text in found:
+        assert kind in LANGUAGES, f"a block of {name} has no language, or another one: {kind!r}"
+        if kind == "python":
+            exec(compile(text, name, "exec"), names)
+        elif kind == "sh":
+            for line in commands(text):
+                check(line, capsys)
+        elif kind == "yaml":
+            assert yaml.safe_load(text)
+    after(names)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_commands_in_the_text_hold_too(name, dry, capsys):
+    if name in pages.GENERATED:
+        pytest.skip("written by `giril report`")
+    text = BLOCK.sub("", (ROOT / name).read_text(encoding="utf-8"))
+    for line in dict.fromkeys(INLINE.findall(" ".join(text.split()))):
+        words = line.split()
+        if not PLACEHOLDER.search(line) and words[1] in ("run", "study", "cp") and len(words) > 2:
+            if words[1] != "cp" and words[2].endswith((".py", ".yaml")):
+                continue  # A file of the reader's.
+            check(line, capsys)
+
+
+def test_few_blocks_are_not_run():
+    reasons = {(name, reason) for name in NAMES for reason, *_ in blocks(name) if reason}
+    assert len(reasons) <= 2, reasons
+
+
+def test_links_lead_to_files_that_are_there():
+    for name in NAMES:
+        text = BLOCK.sub("", (ROOT / name).read_text(encoding="utf-8"))
+        for target in re.findall(r"\]\((?!https?://|#)([^)#]+)", text):
+            assert ((ROOT / name).parent / target).exists(), f"{name}: {target}"
+
+
+@pytest.mark.parametrize(
+    "line", ["giril run girl", "giril run giril ppo.lrr=1", "giril fly", "gril ls"]
+)
+def test_a_wrong_command_is_found(line, dry, capsys):
+    with pytest.raises(AssertionError):
+        check(line, capsys)
