@@ -203,9 +203,7 @@ def test_games_are_seeded_now_and_then(monkeypatch):
     for _ in range(5):
         env.reset()
     entropies = [[4, 0, 0], None, [4, 0, 2], None, [4, 0, 4]]
-    assert seeds == [
-        e and int(np.random.SeedSequence(e).generate_state(1)[0]) for e in entropies
-    ]
+    assert seeds == [e and int(np.random.SeedSequence(e).generate_state(1)[0]) for e in entropies]
 
 
 @pytest.mark.parametrize("cap", [108_000, 160])
