@@ -17,6 +17,7 @@ from giril_rl import recipes
 from giril_rl.cli_parser import Parser as _Parser
 from giril_rl.errors import INTERRUPTED, UserError
 from giril_rl.nearest import did_you_mean
+from giril_rl.places import check_place
 
 
 def _ls(argv: Sequence[str]) -> int:
@@ -79,11 +80,14 @@ def _run(argv: Sequence[str]) -> int:
     jobs: dict[Path, list[str]] = {}
     # All jobs are composed and checked first: a bad value in the last one stops the sweep at once.
     for job in sweep(texts) if args.multirun else [texts]:
-        out = out_folder(recipe.name, *resolved(recipe, schema, job))
+        config, changes = resolved(recipe, schema, job)
+        out = out_folder(recipe.name, config, changes)
         if out in jobs:
             raise UserError(
                 f"two jobs would share the folder {out}: leave out= to giril, or vary it."
             )
+        check_place(out, "out=")
+        check_place(Path(config.root), "root=")
         jobs[out] = job
     module = recipe.load()
 

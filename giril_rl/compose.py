@@ -8,6 +8,7 @@ composed, the override grammar and the sweeps are Hydra's all the same.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, is_dataclass
 from typing import Any
@@ -16,7 +17,7 @@ from hydra import compose as hydra_compose
 from hydra import initialize_config_dir
 from hydra.core.config_store import ConfigStore
 from hydra.errors import HydraException
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from giril_rl.configs import is_atari
@@ -25,9 +26,11 @@ from giril_rl.overrides import KeyCheck, check_settings, normalised, parse
 from giril_rl.recipes import Recipe, shipped_conf
 from giril_rl.schema import flat
 from giril_rl.task_defaults import apply_task_defaults
+from giril_rl.untrusted import check_references, check_yaml, read_text
 
 SCHEMA = "recipe_schema"
 """The entry in a YAML's defaults list that stands for the recipe's own ``Config`` class."""
+_NAME = re.compile(r"\w[\w-]*")
 
 
 @dataclass(frozen=True)
@@ -55,12 +58,16 @@ class Composed:
         Raises:
             UserError: where a mandatory value is missing or an interpolation leads nowhere.
         """
-        for key in _missing(OmegaConf.to_container(self.node, resolve=False)):
+        values = OmegaConf.to_container(self.node, resolve=False)
+        check_references(values)
+        for key in _missing(values):
             hint = "Pendulum-v1" if key == "task.env_id" else "VALUE"
             raise UserError(f"{key} has no value: give one, such as {key}={hint}.")
         try:
             OmegaConf.resolve(self.node)
             built = OmegaConf.to_object(self.node)
+        except RecursionError:
+            raise UserError("a key refers to itself by way of ${...}: give it a value.") from None
         except OmegaConfBaseException as error:
             where = f"{error.full_key}: " if error.full_key else ""
             raise UserError(f"{where}{_first_line(error)}.") from error
@@ -84,14 +91,32 @@ def _load_settings(recipe: Recipe) -> DictConfig:
     import yaml
 
     try:
+        check_yaml(read_text(recipe.yaml))
         loaded = OmegaConf.load(recipe.yaml)
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         line = f", line {mark.line + 1}" if mark else ""
         raise UserError(f"{recipe.yaml} is not valid YAML{line}.") from error
-    if not isinstance(loaded, DictConfig) or SCHEMA not in loaded.get("defaults", []):
+    except (OSError, ValueError, OmegaConfBaseException) as error:
+        raise UserError(f"{recipe.yaml} cannot be read: {_first_line(error)}.") from error
+    defaults = loaded.get("defaults") if isinstance(loaded, DictConfig) else None
+    if not isinstance(defaults, ListConfig) or SCHEMA not in defaults:
         raise UserError(f"{recipe.yaml} needs a `defaults` list with `{SCHEMA}` in it.")
-    return loaded
+    for entry in OmegaConf.to_container(defaults, resolve=False) or ():
+        if entry not in (SCHEMA, "_self_") and not _names_a_choice(entry):
+            raise UserError(
+                f"{recipe.yaml}: {entry!r} in `defaults` is not of the form `group: choice`, with "
+                "the name of a folder and of a file in it."
+            )
+    return loaded  # type: ignore[return-value]
+
+
+def _names_a_choice(entry: Any) -> bool:
+    """Whether an entry is ``group: choice``; paths, packages and Hydra's own groups are not."""
+    if not isinstance(entry, dict) or len(entry) != 1 or "hydra" in entry:
+        return False
+    words = [word for pair in entry.items() for word in pair]
+    return all(isinstance(word, str) and _NAME.fullmatch(word) for word in words)
 
 
 def groups(recipe: Recipe) -> dict[str, tuple[list[str], str]]:

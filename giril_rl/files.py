@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from giril_rl.errors import UserError
+from giril_rl.untrusted import parse_json, read_text
 
 PACKAGES = ("torch", "torchrl", "tensordict", "gymnasium", "pybullet", "ale-py", "giril-rl")
 
@@ -89,7 +90,7 @@ def read_json(path: Path) -> dict[str, Any]:
         UserError: if the file cannot be read or does not hold a JSON object.
     """
     try:
-        value = json.loads(path.read_text(encoding="utf-8"))
+        value = parse_json(read_text(path))
     except (OSError, ValueError) as error:
         raise UserError(f"{path} cannot be read as JSON ({error}): delete or restore it.") from None
     if not isinstance(value, dict):

@@ -14,10 +14,13 @@ from torchrl.data import Bounded, Categorical, OneHot, TensorSpec, Unbounded
 
 from giril_rl.errors import UserError
 from giril_rl.files import installed_versions, read_json, write_json
+from giril_rl.formats import check_format
 
 FORMAT_VERSION = 1
 WEIGHTS = "model.safetensors"
 CARD = "card.json"
+MOST_ENTRIES = 10_000
+"""Of a list in a card; each layer of a network is one."""
 
 Constructor = Callable[..., Any]
 
@@ -117,23 +120,29 @@ class Pretrained:
             raise UserError(
                 f"{folder} holds no saved module ({CARD} and {WEIGHTS}): check the path."
             )
-        module = cls._remade(folder / CARD)
+        weights = load_state(folder / WEIGHTS)
+        unfitting = UserError(
+            f"{folder / WEIGHTS} does not fit its card: the two belong to different modules."
+        )
+        # A card may ask for a network of any size, so that it is made without memory first.
+        if _shapes(cls._remade(folder / CARD, "meta").state_dict()) != _shapes(weights):
+            raise unfitting
+        module = cls._remade(folder / CARD, "cpu")
         try:
-            module.load_state_dict(load_state(folder / WEIGHTS))
+            module.load_state_dict(weights)
         except (RuntimeError, ValueError, TypeError):
-            raise UserError(
-                f"{folder / WEIGHTS} does not fit its card: the two belong to different modules."
-            ) from None
+            raise unfitting from None
         return module.eval()
 
     @classmethod
-    def _remade(cls, path: Path) -> Any:
+    def _remade(cls, path: Path, device: str) -> Any:
         card = read_json(path)
-        if card.get("format_version") != FORMAT_VERSION:
-            raise UserError(
-                f"{path} has format {card.get('format_version')!r} and this version of giril_rl "
-                f"reads only {FORMAT_VERSION}: save the module again with this version."
-            )
+        check_format(
+            card.get("format_version"),
+            [FORMAT_VERSION],
+            where=f"{path} has format",
+            older="load it with the version that wrote it and save its module anew",
+        )
         made_by = card.get("made_by")
         made_by = made_by if isinstance(made_by, dict) else {}
         if made_by.get("class") != cls.__name__:
@@ -144,11 +153,17 @@ class Pretrained:
         constructor = _constructor(cls, made_by.get("constructor"))
         try:
             arguments = {key: _spoken(value) for key, value in made_by["arguments"].items()}
-            return constructor(**arguments)
-        except (KeyError, AttributeError, TypeError, ValueError, RuntimeError) as error:
+            with torch.device(device):
+                return constructor(**arguments)
+        except Exception as error:  # Arguments of any kind and size raise nearly anything.
+            reason = " ".join(str(error).split())[:200]
             raise UserError(
-                f"{path} says of its {cls.__name__} what cannot be made ({error}): restore a copy."
+                f"{path} says of its {cls.__name__} what cannot be made ({reason}): restore a copy."
             ) from None
+
+
+def _shapes(state: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: getattr(value, "shape", None) for name, value in state.items()}
 
 
 def _constructor(cls: type, name: Any) -> Constructor:
@@ -185,6 +200,8 @@ def plain(value: Any) -> Any:
 
 
 def _spoken(value: Any) -> Any:
+    if isinstance(value, list) and len(value) > MOST_ENTRIES:
+        raise ValueError(f"a list of {len(value):,} entries")
     if isinstance(value, dict):
         kind = value["action_spec"]
         if kind == "box":
@@ -200,4 +217,5 @@ def made_class(folder: Path | str) -> str | None:
     """The name of the class that a folder's card is of, None where it has none."""
     path = Path(folder) / CARD
     made_by = read_json(path).get("made_by") if path.is_file() else None
-    return made_by.get("class") if isinstance(made_by, dict) else None
+    name = made_by.get("class") if isinstance(made_by, dict) else None
+    return name if isinstance(name, str) else None

@@ -62,6 +62,8 @@ class Recipe:
             raise UserError(
                 f"{self.path} is not valid Python: {error.msg}, line {error.lineno}."
             ) from error
+        except (ValueError, RecursionError, MemoryError) as error:
+            raise UserError(f"{self.path} is not Python as UTF-8 text ({error}).") from error
 
     def load(self) -> ModuleType:
         """Run the recipe's file as a module and check that it has ``Config`` and ``main``."""

@@ -48,6 +48,23 @@ class Leaf:
         """Whether the knob may be null."""
         return type(None) in get_args(self.type)
 
+    def takes(self, value: Any) -> bool:
+        """Whether a value read from a file is of the knob's type; limits are not looked at.
+
+        Examples:
+            >>> Leaf("lr", float, {}).takes(1), Leaf("seed", int, {}).takes("1")
+            (True, False)
+        """
+        if value is None:
+            return self.optional
+        kinds = [kind for kind in get_args(self.type) if kind is not type(None)]
+        kind = kinds[0] if self.optional else self.type
+        if get_origin(kind) is list:
+            return isinstance(value, list) and all(
+                Leaf(self.key, get_args(kind)[0], {}).takes(entry) for entry in value
+            )
+        return type(value) is kind or (kind is float and type(value) is int)
+
     @property
     def needed(self) -> str:
         """What a value must be, in words.

@@ -105,7 +105,10 @@ def changed(folder, **changes):
 @pytest.mark.parametrize(
     ("changes", "sentence"),
     [
-        ({"format_version": 9}, "has format 9 and this version of giril_rl reads only 1"),
+        (
+            {"format_version": 9},
+            "has format 9, written by a later giril_rl",
+        ),
         ({"class": "CuriosityReward"}, "is of a CuriosityReward, not of a GenerativeReward"),
         ({"made_by": "os.system"}, "is of a None, not of a GenerativeReward"),
         ({"constructor": "__reduce__"}, "has no constructor '__reduce__'"),

@@ -17,6 +17,7 @@ from giril_rl.demos.frames import FRAMES_FILE, load_frames, save_frames
 from giril_rl.demos.storage import load_tensors, save_tensors
 from giril_rl.errors import UserError
 from giril_rl.files import read_json, temporary_sibling, write_json
+from giril_rl.formats import check_format
 
 FORMAT_VERSION = 1
 """Of vectors."""
@@ -147,11 +148,13 @@ class Demonstration:
             )
         card = read_json(folder / "card.json")
         version = card.get("format_version")
-        if version not in (FORMAT_VERSION, IMAGE_FORMAT_VERSION):
-            raise UserError(
-                f"{folder} has demonstration format {version!r} and this version of giril_rl reads "
-                f"only {FORMAT_VERSION} and {IMAGE_FORMAT_VERSION}: record it anew."
-            )
+        check_format(
+            version,
+            [FORMAT_VERSION, IMAGE_FORMAT_VERSION],
+            where=f"{folder} has demonstration format",
+            older="export it as .npz with the version that wrote it and import that, or record it "
+            "anew",
+        )
         if version == IMAGE_FORMAT_VERSION and not (folder / FRAMES_FILE).is_file():
             raise UserError(
                 f"{folder} has demonstration format {version} and no {FRAMES_FILE}: restore a "

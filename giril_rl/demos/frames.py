@@ -14,6 +14,7 @@ from torch import Tensor
 
 from giril_rl.errors import UserError
 from giril_rl.files import sync
+from giril_rl.untrusted import check_memory
 
 FRAMES_FILE = "frames.npz"
 
@@ -93,6 +94,8 @@ def load_frames(path: Path, declared: Any, length: int) -> tuple[Tensor, Tensor]
     try:
         fault = _fault(path, wanted)
         if fault is None:
+            # The planes as read and as they were, and both columns of images.
+            check_memory(str(path), 2 * (count + length * shape[0]) * shape[1] * shape[2])
             with np.load(path, allow_pickle=False) as archive:
                 change, *index = (archive[name] for name in wanted)
     except _BROKEN as error:

@@ -7,7 +7,6 @@ the arrays that are needed and nothing else.
 
 from __future__ import annotations
 
-import json
 import os
 import re
 from pathlib import Path
@@ -18,6 +17,7 @@ import numpy as np
 from giril_rl.demos.arrays import from_episodes
 from giril_rl.demos.npz import MOST_PACKED
 from giril_rl.errors import UserError
+from giril_rl.untrusted import check_memory, parse_json, read_text
 
 _NAME = re.compile(r"[-\w]+(/[-\w]+)*-v\d+", re.ASCII)
 _ARRAYS = {
@@ -97,8 +97,8 @@ def _metadata(path: Path, name: str) -> dict[str, Any]:
             "`minari download` fetches one."
         )
     try:
-        metadata = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, RecursionError):
+        metadata = parse_json(read_text(path))
+    except (OSError, ValueError):
         metadata = None
     if not isinstance(metadata, dict):
         raise UserError(f"the Minari dataset {name} has damaged metadata: fetch it anew.")
@@ -122,8 +122,8 @@ def _read(
         found.append({ours: _array(h5py, group, theirs, name) for ours, theirs in _ARRAYS.items()})
         seeds.append(group.attrs.get("seed"))
     try:
-        card = json.loads(metadata.get("description") or "{}")
-    except (ValueError, TypeError, RecursionError):
+        card = parse_json(metadata.get("description") or "{}")
+    except (ValueError, TypeError):
         card = {}  # Most descriptions are prose.
     card = card if isinstance(card, dict) else {}
     if card.get("last_cut") is True and len(found) == held:
@@ -165,4 +165,5 @@ def _array(h5py: Any, group: Any, key: str, name: str) -> np.ndarray:
         )
     if data.nbytes > MOST_PACKED * max(data.id.get_storage_size(), 1):
         raise UserError(f"the Minari dataset {name} has {key} larger than its file: fetch it anew.")
+    check_memory(f"the Minari dataset {name}", data.nbytes)
     return np.asarray(data[()])

@@ -17,6 +17,7 @@ from giril_rl.demos.demonstration import Demonstration
 from giril_rl.errors import UserError
 from giril_rl.files import sync, temporary_sibling
 from giril_rl.nearest import did_you_mean
+from giril_rl.untrusted import check_memory, parse_json
 
 EPISODES = ("observations", "actions", "lengths", "terminated")
 _KNOWN = {*NEEDED, "reward", *EPISODES, "rewards", "card"}
@@ -49,7 +50,9 @@ def read_npz(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         raise UserError(f"there is no file {path}: name an .npz file.")
     try:
         with zipfile.ZipFile(path) as archive:
-            arrays = {name: _array(archive, name) for name in _names(archive)}
+            names = _names(archive)
+            check_memory(path.name, sum(member.file_size for member in archive.infolist()))
+            arrays = {name: _array(archive, name) for name in names}
     except _BROKEN as error:
         raise UserError(
             f"{path.name} is no .npz file, or was cut short ({error}): write it anew."
@@ -139,8 +142,8 @@ def _array(archive: zipfile.ZipFile, name: str) -> np.ndarray:
 def _card(array: np.ndarray | None) -> dict[str, Any]:
     """The card of an export; what others call so is worth nothing here."""
     try:
-        card = json.loads(array.tobytes()) if array is not None else {}
-    except (ValueError, RecursionError):
+        card = parse_json(array.tobytes()) if array is not None else {}
+    except ValueError:
         card = {}
     return card if isinstance(card, dict) else {}
 

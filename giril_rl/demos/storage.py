@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Collection
 from pathlib import Path
@@ -13,6 +12,7 @@ from tensordict import TensorDict
 
 from giril_rl.errors import UserError
 from giril_rl.files import sync
+from giril_rl.untrusted import check_memory, parse_json, read_text
 
 _DTYPES = ("float32", "int64", "bool")
 _TENSORDICT = "<class 'tensordict._td.TensorDict'>"
@@ -55,11 +55,13 @@ def load_tensors(folder: Path, dtypes: Collection[str] = _DTYPES) -> TensorDict:
 
 def _inspect(folder: Path, dtypes: Collection[str], *, top: bool) -> None:
     try:
-        meta = json.loads((folder / "meta.json").read_text(encoding="utf-8"))
+        meta = parse_json(read_text(folder / "meta.json"))
     except (OSError, ValueError) as error:
         raise UserError(f"{folder} is damaged ({error}): record it anew.") from None
     if not isinstance(meta, dict) or meta.get("_type") != _TENSORDICT:
         raise UserError(f"{folder} holds something other than a TensorDict: record it anew.")
+    if not _is_shape(meta.get("shape")) or meta.get("device") not in ("cpu", "None", None):
+        raise UserError(f"{folder} has damaged metadata: restore a copy, or record it anew.")
     expected = {"meta.json"}
     for key, entry in meta.items():
         if key in ("shape", "device", "_type"):
@@ -72,6 +74,9 @@ def _inspect(folder: Path, dtypes: Collection[str], *, top: bool) -> None:
             expected.add(f"{key}.memmap")
     # A stray file may be what an object is unpickled from.
     strays = sorted(path.name for path in folder.iterdir() if path.name not in expected)
+    links = sorted(path.name for path in folder.iterdir() if path.is_symlink())
+    if links:
+        raise UserError(f"{folder} has the link {links[0]!r} in it: copy the file itself there.")
     if strays:
         raise UserError(f"{folder} holds {strays[0]!r}, which is not a tensor: record it anew.")
 
@@ -85,8 +90,7 @@ def _inspect_tensor(folder: Path, key: str, entry: Any, dtypes: Collection[str])
         or entry["dtype"] not in [f"torch.{name}" for name in dtypes]
         or entry["is_nested"] is not False
         or entry["device"] != "cpu"
-        or not isinstance(entry["shape"], list)
-        or not all(type(size) is int and size >= 0 for size in entry["shape"])
+        or not _is_shape(entry["shape"])
     ):
         raise UserError(f"{folder} holds {key!r}, which is not a plain tensor: record it anew.")
     path = folder / f"{key}.memmap"
@@ -97,3 +101,8 @@ def _inspect_tensor(folder: Path, key: str, entry: Any, dtypes: Collection[str])
     if found != wanted:
         state = "is missing" if found is None else f"has {found} bytes instead of {wanted}"
         raise UserError(f"{path} {state}: restore a copy, or record the demonstration anew.")
+    check_memory(str(path), wanted)  # A sparse file is as large as it likes.
+
+
+def _is_shape(value: Any) -> bool:
+    return isinstance(value, list) and all(type(size) is int and size >= 0 for size in value)

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from giril_rl.files import csv_text, write_atomically
 from giril_rl.naming import safe
+from giril_rl.places import check_place
 from giril_rl.report.bars import draw_bars
 from giril_rl.report.curves import draw_results, draw_varied
 from giril_rl.report.formats import budget_text, markdown, seeds_text, steps_text, to_csv
@@ -48,6 +49,7 @@ def write_report(folder: Path, out: Path) -> str:
         UserError: where there is no finished run, or rliable is missing.
     """
     load_rliable()
+    check_place(out, "--out")
     runs, unfinished = read_runs(folder)
     panels = panels_of(runs)
     tables = [table for panel in panels for table in tables_of(panel)]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,9 +9,11 @@ from typing import Any
 import yaml
 
 from giril_rl.errors import UserError
-from giril_rl.files import read_json
+from giril_rl.formats import check_run_format
 from giril_rl.schema import flat
+from giril_rl.training.finished import read_result
 from giril_rl.training.metrics import read_metrics
+from giril_rl.untrusted import parse_json, parse_yaml, read_text
 
 
 @dataclass(frozen=True)
@@ -88,10 +89,12 @@ def read_runs(folder: Path) -> tuple[list[RunRecord], list[Unfinished]]:
             continue
         if not {"recipe", "task.name", "seed", "steps"} <= set(config):
             continue  # Another program's config.yaml.
-        result = path.with_name("result.json")
-        record = RunRecord(
-            path.parent, name, config, read_json(result) if result.exists() else None
-        )
+        if not all(type(config[key]) is int for key in ("seed", "steps")):
+            others[name] = Unfinished(name, "unfinished", "", "its config.yaml is not a run's")
+            continue
+        check_run_format(path.parent)
+        result = read_result(path.parent) if path.with_name("result.json").exists() else None
+        record = RunRecord(path.parent, name, config, result)
         if record.result is not None:
             finished.append(record)
         else:
@@ -113,7 +116,7 @@ def read_runs(folder: Path) -> tuple[list[RunRecord], list[Unfinished]]:
 
 def _config(path: Path) -> dict[str, Any] | None:
     try:
-        config = yaml.safe_load(path.read_text(encoding="utf-8"))
+        config = parse_yaml(read_text(path))
     except (OSError, ValueError, yaml.YAMLError):
         return None
     return flat(config) if isinstance(config, dict) else None
@@ -134,7 +137,7 @@ def _standings(folder: Path) -> dict[str, tuple[str, str]]:
     for path in sorted(folder.glob("**/studies/*/status.json")):
         root = path.parents[2]
         try:
-            rows = json.loads(path.read_text(encoding="utf-8"))["runs"]
+            rows = parse_json(read_text(path))["runs"]
             for row in rows:
                 state = _STATES.get(row["state"])
                 place = (root / row["folder"]).relative_to(folder).as_posix()

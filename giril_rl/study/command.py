@@ -6,6 +6,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from giril_rl.places import check_place
 from giril_rl.study.config import StudyConfig
 from giril_rl.study.execute import Launcher, execute
 from giril_rl.study.plan import Planner, StudyRun
@@ -58,6 +59,7 @@ def run_study(name: str, texts: Sequence[str], *, dry_run: bool = False) -> int:
     """
     spec = read_spec(find_study(name))
     settings, changes = settings_of(texts)
+    check_place(Path(settings.root), "root=")
     study = StudyFolder(spec, changes, Planner(Path(settings.root)).plan(spec, changes))
     finished = study.count("finished")
     if dry_run:

@@ -11,6 +11,7 @@ from giril_rl.errors import UserError
 from giril_rl.nearest import did_you_mean
 from giril_rl.recipes import shipped_conf
 from giril_rl.schema import flat
+from giril_rl.untrusted import check_yaml, read_text
 
 _KEYS = ("title", "all", "groups")
 
@@ -109,6 +110,7 @@ def _load(path: Path) -> dict[str, Any]:
     from omegaconf.errors import OmegaConfBaseException
 
     try:
+        check_yaml(read_text(path))
         # OmegaConf's reader knows 1e-4 for a number and refuses a key that is given twice.
         loaded = OmegaConf.load(path)
         content = OmegaConf.to_container(loaded, resolve=False)
@@ -117,7 +119,7 @@ def _load(path: Path) -> dict[str, Any]:
         line = f", line {mark.line + 1}" if mark else ""
         problem = getattr(error, "problem", None) or "not valid YAML"
         raise UserError(f"{path}{line}: {problem}; correct it.") from error
-    except (OSError, UnicodeDecodeError, OmegaConfBaseException) as error:
+    except (OSError, ValueError, OmegaConfBaseException) as error:
         raise UserError(f"{path} cannot be read as YAML: {str(error).splitlines()[0]}.") from error
     if not isinstance(loaded, DictConfig) or not isinstance(content, dict):
         raise UserError(f"{path} is not a study: it needs `groups`, a list.")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
@@ -15,6 +14,7 @@ from giril_rl.files import csv_text, write_atomically, write_json
 from giril_rl.naming import config_hash, safe
 from giril_rl.study.plan import StudyRun
 from giril_rl.study.spec import Spec
+from giril_rl.untrusted import parse_json, read_text
 
 State = Literal["waiting", "running", "finished", "failed", "interrupted"]
 
@@ -74,11 +74,11 @@ class StudyFolder:
     def _before(self) -> dict[str, Standing]:
         """The finished runs that the folder knows of, with what they took."""
         try:
-            rows = json.loads((self.path / "status.json").read_text(encoding="utf-8"))["runs"]
+            rows = parse_json(read_text(self.path / "status.json"))["runs"]
             known = [Standing(**row) for row in rows]
+            return {row.folder: row for row in known if row.state == "finished"}
         except (OSError, ValueError, TypeError, KeyError):
             return {}  # None yet, or of another version: only times are lost.
-        return {row.folder: row for row in known if row.state == "finished"}
 
     def _standing(self, run: StudyRun) -> Standing:
         return Standing(

@@ -14,6 +14,8 @@ from torch import Tensor
 
 from giril_rl.errors import UserError
 from giril_rl.files import write_atomically
+from giril_rl.formats import check_format
+from giril_rl.untrusted import parse_json
 
 FORMAT_VERSION = "1"
 
@@ -80,18 +82,22 @@ def load_state(path: Path | str) -> dict[str, Any]:
             tensors = {name: file.get_tensor(name) for name in file.keys()}
     except (SafetensorError, OSError, ValueError) as error:
         raise _damaged(path, str(error)) from None
-    found = metadata.get("format_version")
-    if found != FORMAT_VERSION:
-        raise UserError(
-            f"{path} has checkpoint format {found!r} and this version of giril_rl reads only "
-            f"{FORMAT_VERSION!r}: use the version that wrote it, or delete the file to start again."
-        )
+    found = str(metadata.get("format_version"))
+    check_format(
+        int(found) if found.isdecimal() and len(found) < 10 else found,
+        [int(FORMAT_VERSION)],
+        where=f"{path} has checkpoint format",
+        older="finish with the version that wrote it, or delete the file to start that part again",
+    )
     try:
         structure = metadata["structure"]
         if metadata["crc32"] != _checksum(structure, tensors):
             raise ValueError("checksum differs")
-        return _rebuild(json.loads(structure), tensors)
-    except (KeyError, ValueError, TypeError) as error:
+        state = _rebuild(parse_json(structure), tensors)
+        if not isinstance(state, dict):
+            raise ValueError("it holds no named values")
+        return state
+    except (KeyError, ValueError, TypeError, AttributeError, RecursionError) as error:
         raise _damaged(path, str(error)) from None
 
 

@@ -21,6 +21,7 @@ from giril_rl.progress import progress
 from giril_rl.rewards.chunks import PIXELS_AT_ONCE
 from giril_rl.training.interrupt import Interrupt, Interrupted
 from giril_rl.training.ppo import Trained
+from giril_rl.training.restoring import restoring
 
 if TYPE_CHECKING:
     from giril_rl.training.run import Run
@@ -87,10 +88,11 @@ def clone_behaviour(
     best: dict[str, Any] = {"step": 0, "loss": float("inf"), "actor": {}}
     saved = run.load(phase)
     if saved is not None:
-        step, seconds, best = saved["step"], saved["seconds"], saved["best"]
-        agent.actor.load_state_dict(saved["actor"])
-        optimizer.load_state_dict(saved["optimizer"])
-        generator.set_state(saved["minibatches"])
+        with restoring(run, phase):
+            step, seconds, best = saved["step"], saved["seconds"], saved["best"]
+            agent.actor.load_state_dict(saved["actor"])
+            optimizer.load_state_dict(saved["optimizer"])
+            generator.set_state(saved["minibatches"])
     run.truncate_metrics(phase, step)
     began = time.perf_counter() - seconds
 

@@ -134,7 +134,8 @@ def check_inputs(cfg: RunConfig, expert: ExpertConfig, demo: DemoConfig) -> None
     if demo.path is not None:
         _given_demonstration(cfg.task, demo.path)
     elif expert.path is not None:
-        obtain_expert(cfg, expert)
+        folder, _ = obtain_expert(cfg, expert)
+        load_agent(folder, cfg.task)
 
 
 def _given_demonstration(task: TaskConfig, path: str) -> Demonstration:

@@ -11,25 +11,47 @@ import yaml
 from giril_rl.configs import EvalConfig, TaskConfig
 from giril_rl.errors import UserError
 from giril_rl.files import read_json, write_json
+from giril_rl.formats import check_run_format
+from giril_rl.places import check_place
+from giril_rl.schema import leaves
 from giril_rl.training.agent import load_agent
 from giril_rl.training.evaluate import Player, evaluate_both
 from giril_rl.training.random_policy import RANDOM, RandomPolicy
+from giril_rl.untrusted import parse_yaml, read_text
+from giril_rl.validation import validate
 
 Part = TypeVar("Part")
+RESULT_KEYS: dict[str, type | tuple[type, ...]] = {
+    "method": str,
+    "task": str,
+    "seed": int,
+    "env_steps": int,
+    "episodes": int,
+    "return_mean": (int, float),
+    "config_hash": str,
+}
+"""What every ``result.json`` has, and the types."""
 
 
 def read_result(folder: Path) -> dict[str, Any]:
     """A finished run's ``result.json``.
 
     Raises:
-        UserError: if the folder holds no finished run.
+        UserError: if the folder holds no finished run, one of a later format or a damaged one.
     """
+    check_run_format(folder)
     path = folder / "result.json"
     if not path.exists():
         raise UserError(
             f"{folder} holds no finished run (no result.json): run it to its end first."
         )
-    return read_json(path)
+    result = read_json(path)
+    for key, kind in RESULT_KEYS.items():
+        if not isinstance(result.get(key), kind):
+            raise UserError(
+                f"{path} has no {key} as a run writes it: restore a copy, or make the run anew."
+            )
+    return result
 
 
 def read_settings(folder: Path) -> tuple[TaskConfig, EvalConfig]:
@@ -52,7 +74,7 @@ def read_config(folder: Path) -> dict[str, Any]:
         UserError: if the file is missing or is not what a run writes.
     """
     try:
-        config = yaml.safe_load((folder / "config.yaml").read_text(encoding="utf-8"))
+        config = parse_yaml(read_text(folder / "config.yaml"))
     except (OSError, ValueError, yaml.YAMLError):
         raise _no_run(folder) from None
     if not isinstance(config, dict):
@@ -70,9 +92,17 @@ def read_part(folder: Path, config: dict[str, Any], name: str, kind: type[Part])
     """
     names = {f.name for f in fields(kind)}  # type: ignore[arg-type]
     try:
-        return kind(**{key: value for key, value in config[name].items() if key in names})
+        part = kind(**{key: value for key, value in config[name].items() if key in names})
     except (KeyError, TypeError, AttributeError):
         raise _no_run(folder) from None
+    try:
+        for leaf in leaves(kind):
+            if not leaf.takes(getattr(part, leaf.key)):
+                raise UserError(f"{leaf.key}={getattr(part, leaf.key)}: {leaf.needed} is needed.")
+        validate(part)
+    except UserError as error:
+        raise UserError(f"{folder / 'config.yaml'}: {name}.{error}") from None
+    return part
 
 
 def evaluate_run(folder: Path, episodes: int | None = None, seed: int | None = None) -> None:
@@ -90,6 +120,7 @@ def evaluate_run(folder: Path, episodes: int | None = None, seed: int | None = N
     """
     result = read_result(folder)
     task, settings = read_settings(folder)
+    check_place(folder, "folder, such as a copy of it")
     agent: Player
     if result["method"] == RANDOM:
         agent = RandomPolicy.of_task(task, result["seed"])

@@ -15,6 +15,7 @@ from giril_rl.progress import progress
 from giril_rl.rewards.chunks import PIXELS_AT_ONCE
 from giril_rl.training.interrupt import Interrupt, Interrupted
 from giril_rl.training.randomness import restore_rng, rng_state, seeded
+from giril_rl.training.restoring import restoring
 from giril_rl.training.traced import TracedGradients
 
 if TYPE_CHECKING:
@@ -62,11 +63,12 @@ def fit_reward(
     step, seconds = 0, 0.0
     saved = run.load(phase)
     if saved is not None:
-        step, seconds = saved["step"], saved["seconds"]
-        loss.load_state_dict(saved["loss"])
-        optimizer.load_state_dict(saved["optimizer"])
-        generator.set_state(saved["minibatches"])
-        restore_rng(saved["rng"])
+        with restoring(run, phase):
+            step, seconds = saved["step"], saved["seconds"]
+            loss.load_state_dict(saved["loss"])
+            optimizer.load_state_dict(saved["optimizer"])
+            generator.set_state(saved["minibatches"])
+            restore_rng(saved["rng"])
     run.truncate_metrics(phase, step)
     began = time.perf_counter() - seconds
     with Interrupt() as interrupt, progress(cfg.steps, step, "reward model") as bar:

@@ -12,6 +12,7 @@ from typing import Any, Literal, get_args
 
 from giril_rl.errors import UserError
 from giril_rl.files import write_atomically
+from giril_rl.untrusted import parse_json
 
 LoggerName = Literal["tensorboard", "csv", "wandb", "mlflow"]
 
@@ -31,10 +32,10 @@ def read_metrics(path: Path) -> list[dict[str, Any]]:
     rows = []
     for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
         try:
-            row = json.loads(line)
+            row = parse_json(line)
         except ValueError:
             continue
-        if isinstance(row, dict):
+        if isinstance(row, dict) and "phase" in row and type(row.get("step")) is int:
             rows.append(row)
     return rows
 

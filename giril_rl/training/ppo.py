@@ -22,6 +22,7 @@ from giril_rl.progress import progress
 from giril_rl.training.episodes import EpisodeTracker
 from giril_rl.training.interrupt import Interrupt, Interrupted
 from giril_rl.training.randomness import restore_rng, rng_state
+from giril_rl.training.restoring import restoring
 from giril_rl.training.traced import TracedGradients
 
 if TYPE_CHECKING:
@@ -90,13 +91,13 @@ def train_ppo(
     taken = 0
     saved = run.load(phase)
     if saved is not None:
-        taken = saved["steps"]
-        recent.extend(saved["recent"])
-    if saved is not None and (taken >= steps or saved["stopped"]):
-        parts.load_state_dict(saved["parts"])
-        return Trained(taken, saved["seconds"])
-    if saved is not None:
-        env.restore_simulator(saved["simulator"])
+        with restoring(run, phase):
+            taken = saved["steps"]
+            recent.extend(saved["recent"])
+            if taken >= steps or saved["stopped"]:
+                parts.load_state_dict(saved["parts"])
+                return Trained(taken, saved["seconds"])
+            env.restore_simulator(saved["simulator"])
     batch_size = cfg.num_envs * cfg.rollout
     collector = Collector(
         env,
@@ -110,11 +111,12 @@ def train_ppo(
     # Only now, for making a collector may draw random numbers.
     torch.manual_seed(seed)
     if saved is not None:
-        parts.load_state_dict(saved["parts"])
-        learner.optimizer.load_state_dict(saved["optimizer"])
-        if learn_reward is not None:
-            learn_reward.load_state_dict(saved["reward_learner"])
-        restore_rng(saved["rng"])
+        with restoring(run, phase):
+            parts.load_state_dict(saved["parts"])
+            learner.optimizer.load_state_dict(saved["optimizer"])
+            if learn_reward is not None:
+                learn_reward.load_state_dict(saved["reward_learner"])
+            restore_rng(saved["rng"])
     run.truncate_metrics(phase, taken)
     next_save = (taken // cfg.checkpoint_every + 1) * cfg.checkpoint_every
     stopped = False

@@ -14,10 +14,13 @@ from filelock import FileLock, Timeout
 
 from giril_rl.errors import UserError
 from giril_rl.files import installed_versions, read_json, write_atomically, write_json
+from giril_rl.formats import RUN_FORMAT, check_run_format
 from giril_rl.naming import NO_EFFECT, without_added
+from giril_rl.places import cannot_write, check_place
 from giril_rl.schema import flat
 from giril_rl.training.checkpoint import load_state, save_state
 from giril_rl.training.metrics import MetricsFile, check_logger, make_logger
+from giril_rl.untrusted import parse_yaml, read_text
 
 
 class Run:
@@ -25,7 +28,8 @@ class Run:
 
     ========================  ====================================================================
     ``config.yaml``           the resolved configuration, with the recipe's name
-    ``versions.json``         Python and the packages that decide the numbers
+    ``versions.json``         the format of the folder, Python and the packages that decide the
+                              numbers
     ``metrics.jsonl``         measurements, one JSON object a line
     ``NAME.safetensors``      checkpoints, see :func:`giril_rl.training.checkpoint.save_state`
     ``result.json``           written last; where it is, the run is finished
@@ -85,20 +89,25 @@ class Run:
                 use, or if the logger is unknown or not installed.
         """
         check_logger(logger)
+        check_place(Path(folder), "out=")
         run = cls(Path(folder), config, recipe, logger)
         run._refuse_foreign_folder()
-        run.folder.mkdir(parents=True, exist_ok=True)
+        check_run_format(run.folder)
         try:
+            run.folder.mkdir(parents=True, exist_ok=True)
             run._lock.acquire(blocking=False)
         except Timeout:
             raise UserError(
                 f"{run.folder} is in use by another process: wait for it to end, "
                 "or choose another out=."
             ) from None
+        except OSError as error:
+            raise cannot_write(run.folder, "out=", error) from None
         try:
             for leftover in run.folder.glob(".*.tmp"):
                 leftover.unlink()
             run._write_or_compare_config(ignore)
+            run._check_checkpoints()
             run._write_versions()
             run._metrics = MetricsFile(run.folder / "metrics.jsonl")
         except BaseException:
@@ -173,8 +182,6 @@ class Run:
         self.close()
 
     def _refuse_foreign_folder(self) -> None:
-        if self.folder.exists() and not self.folder.is_dir():
-            raise UserError(f"{self.folder} is a file: choose another out=.")
         if not self.folder.exists() or (self.folder / "config.yaml").exists():
             return
         others = sorted(
@@ -196,7 +203,7 @@ class Run:
             write_atomically(path, yaml.safe_dump(config, sort_keys=False))
             return
         try:
-            before = yaml.safe_load(path.read_text(encoding="utf-8"))
+            before = parse_yaml(read_text(path))
         except (OSError, ValueError, yaml.YAMLError):
             before = None
         if not isinstance(before, dict):
@@ -208,6 +215,12 @@ class Run:
                 f"{self.folder} was made with other settings ({'; '.join(differences[:3])}{more}): "
                 "choose another out=, or delete the folder."
             )
+
+    def _check_checkpoints(self) -> None:
+        """A damaged one is refused now, not when its part's turn has come."""
+        if not self.finished:
+            for path in sorted(self.folder.glob("*.safetensors")):
+                load_state(path)
 
     def _write_versions(self) -> None:
         path = self.folder / "versions.json"
@@ -221,7 +234,7 @@ class Run:
                     f"{now}: its numbers may not repeat.",
                     stacklevel=4,
                 )
-        write_json(path, self.versions)
+        write_json(path, {"format_version": RUN_FORMAT, **self.versions})
 
 
 def _differences(

@@ -145,10 +145,10 @@ def test_damaged_file_is_named(tmp_path, damage):
 def test_unknown_format_version_and_foreign_file_are_refused(tmp_path):
     path = tmp_path / "a.safetensors"
     save_file({"x": torch.zeros(1)}, path, {"format_version": "2"})
-    with pytest.raises(UserError, match="format '2'"):
+    with pytest.raises(UserError, match="format 2, written by a later giril_rl"):
         load_state(path)
     save_file({"x": torch.zeros(1)}, path)
-    with pytest.raises(UserError, match="format None"):
+    with pytest.raises(UserError, match="format 'None', and this giril_rl reads only 1"):
         load_state(path)
     save_file({}, path, {"format_version": "1", "structure": json.dumps({"dict": []})})
     with pytest.raises(UserError, match="damaged"):
