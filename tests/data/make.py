@@ -1,0 +1,80 @@
+"""Writes this folder's data anew: ``python tests/data/make.py``.
+
+It is kept to prove that files of an earlier giril_rl are still read: write it anew only where a
+format has a new number, and keep the old files beside the new ones.
+"""
+
+import os
+import shutil
+from pathlib import Path
+
+import gymnasium
+import torch
+from tensordict import TensorDict
+
+from giril_rl.cli import main
+from giril_rl.demos import Demonstration, record_demonstration
+
+WORDS = [
+    "task.env_id=CartPole-v1",
+    "demo.path=demonstration",
+    "demo.subsample=2",
+    "steps=256",
+    "ppo.num_envs=2",
+    "ppo.rollout=64",
+    "ppo.minibatch=64",
+    "ppo.epochs=1",
+    "ppo.hidden=[8]",
+    "reward.hidden=[8]",
+    "fit.steps=10",
+    "eval.episodes=1",
+    "logger=null",
+    "out=run",
+]
+"""The run's settings; the same words continue it."""
+
+
+def vectors() -> Demonstration:
+    return record_demonstration(
+        lambda: gymnasium.make("CartPole-v1"),
+        lambda observation: (observation[:, 2] + observation[:, 3] > 0).long(),
+        length=40,
+        seed=0,
+        task="CartPole-v1",
+    )
+
+
+def images() -> Demonstration:
+    frames = torch.arange(5, dtype=torch.uint8).reshape(5, 1, 1, 1).expand(5, 2, 6, 6).contiguous()
+    end = torch.tensor([[False], [False], [False], [True]])
+    after = {
+        "observation": frames[1:],
+        "reward": torch.ones(4, 1),
+        "terminated": end,
+        "truncated": ~end & False,
+        "done": end,
+    }
+    transitions = {
+        "observation": frames[:-1],
+        "action": torch.tensor([0, 1, 2, 0]),
+        "episode": torch.zeros(4, dtype=torch.int64),
+        "step": torch.arange(4),
+        "next": TensorDict(after, [4]),
+    }
+    return Demonstration(TensorDict(transitions, [4]), {"task": "frames", "seeds": [0]})
+
+
+def make(folder: Path) -> None:
+    os.chdir(folder)
+    for name in ("demonstration", "demonstration_of_images", "run"):
+        shutil.rmtree(name, ignore_errors=True)
+    vectors().save("demonstration")
+    images().save("demonstration_of_images")
+    assert main(["run", "giril", *WORDS]) == 0
+    for picture in Path("run").glob("*.png"):
+        picture.unlink()
+    Path("run/.lock").unlink(missing_ok=True)
+
+
+if __name__ == "__main__":
+    make(Path(__file__).resolve().parent)
