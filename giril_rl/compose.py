@@ -11,6 +11,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, is_dataclass
+from pathlib import Path
 from typing import Any
 
 from hydra import compose as hydra_compose
@@ -66,11 +67,10 @@ class Composed:
         try:
             OmegaConf.resolve(self.node)
             built = OmegaConf.to_object(self.node)
-        except RecursionError:
-            raise UserError("a key refers to itself by way of ${...}: give it a value.") from None
-        except OmegaConfBaseException as error:
-            where = f"{error.full_key}: " if error.full_key else ""
-            raise UserError(f"{where}{_first_line(error)}.") from error
+        except (OmegaConfBaseException, RecursionError) as error:
+            key = getattr(error, "full_key", None)
+            where = f"{key}: " if key else "in ${...}: "
+            raise UserError(f"{where}{_first_line(error)}; write the value itself.") from error
         return apply_task_defaults(built, self.chosen)
 
 
@@ -87,18 +87,22 @@ def _first_line(error: Exception) -> str:
     return (str(error).strip().splitlines() or [type(error).__name__])[0].rstrip(".")
 
 
-def _load_settings(recipe: Recipe) -> DictConfig:
+def _load(path: Path) -> Any:
     import yaml
 
     try:
-        check_yaml(read_text(recipe.yaml))
-        loaded = OmegaConf.load(recipe.yaml)
+        check_yaml(read_text(path))
+        return OmegaConf.load(path)
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         line = f", line {mark.line + 1}" if mark else ""
-        raise UserError(f"{recipe.yaml} is not valid YAML{line}.") from error
+        raise UserError(f"{path} is not valid YAML{line}.") from error
     except (OSError, ValueError, OmegaConfBaseException) as error:
-        raise UserError(f"{recipe.yaml} cannot be read: {_first_line(error)}.") from error
+        raise UserError(f"{path} cannot be read: {_first_line(error)}.") from error
+
+
+def _load_settings(recipe: Recipe) -> DictConfig:
+    loaded = _load(recipe.yaml)
     defaults = loaded.get("defaults") if isinstance(loaded, DictConfig) else None
     if not isinstance(defaults, ListConfig) or SCHEMA not in defaults:
         raise UserError(f"{recipe.yaml} needs a `defaults` list with `{SCHEMA}` in it.")
@@ -108,7 +112,7 @@ def _load_settings(recipe: Recipe) -> DictConfig:
                 f"{recipe.yaml}: {entry!r} in `defaults` is not of the form `group: choice`, with "
                 "the name of a folder and of a file in it."
             )
-    return loaded  # type: ignore[return-value]
+    return loaded
 
 
 def _names_a_choice(entry: Any) -> bool:
@@ -169,7 +173,8 @@ def compose(recipe: Recipe, config: type[Any], texts: Sequence[str]) -> Composed
         >>> composed.config().task.name, composed.config().steps
         ('Pendulum-v1', 1000)
     """
-    choices = {group: names for group, (names, _) in groups(recipe).items()}
+    found = groups(recipe)
+    choices = {group: names for group, (names, _) in found.items()}
     check = KeyCheck(recipe.word, config, choices)
     settings = OmegaConf.to_container(_load_settings(recipe), resolve=False)
     assert isinstance(settings, dict)
@@ -177,6 +182,12 @@ def compose(recipe: Recipe, config: type[Any], texts: Sequence[str]) -> Composed
     overrides = parse(_with_task(texts))
     for override in overrides:
         check.override(override)
+    chosen = {group: default for group, (_, default) in found.items()}
+    chosen |= {key: o.value() for o in overrides if (key := o.get_key_element()) in found}
+    for group, choice in chosen.items():
+        own = recipe.yaml.parent / group / f"{choice}.yaml"
+        if own.is_file():
+            _load(own)
 
     ConfigStore.instance().store(name=SCHEMA, node=config)
     lines = [normalised(override) for override in overrides]

@@ -141,6 +141,8 @@ def _standings(folder: Path) -> dict[str, tuple[str, str]]:
             for row in rows:
                 state = _STATES.get(row["state"])
                 place = (root / row["folder"]).relative_to(folder).as_posix()
+                if ".." in Path(place).parts:
+                    continue  # Not of this folder.
                 if state and found.get(place, ("",))[0] != "failed":
                     found[place] = (state, str(row["last_line"] or ""))
         except (OSError, ValueError, KeyError, TypeError):

@@ -18,6 +18,8 @@ from giril_rl.training.fitted import find_demonstration
 
 pytest.importorskip("ale_py")
 KEY = ("next", "intrinsic_reward")
+RESULT = {"method": "giril", "task": "breakout", "seed": 3, "env_steps": 1, "episodes": 1}
+RESULT |= {"return_mean": 0.0, "config_hash": "ba9876543210", "demo_transitions": 6}
 
 
 @pytest.fixture
@@ -31,7 +33,7 @@ def made(tmp_path):
         folder = tmp_path / recipe / "breakout" / "default" / "seed3"
         folder.mkdir(parents=True)
         (folder / "config.yaml").write_text(yaml.safe_dump({"recipe": recipe, **asdict(cfg)}))
-        (folder / "result.json").write_text(json.dumps({"method": recipe, "demo_transitions": 6}))
+        (folder / "result.json").write_text(json.dumps({**RESULT, "method": recipe}))
         return folder, cfg
 
     return write
@@ -73,7 +75,7 @@ def test_the_demonstration_is_found_and_never_made(made, tmp_path, monkeypatch):
         (tmp_path / name).rename(moved / name)
     folder = moved / folder.relative_to(tmp_path)
     assert len(find_demonstration(folder)) == 6
-    (folder / "result.json").write_text('{"method": "giril", "demo_transitions": 7}')
+    (folder / "result.json").write_text(json.dumps({**RESULT, "demo_transitions": 7}))
     assert find_demonstration(folder) is None  # Another one lies there by now.
 
 
@@ -89,5 +91,5 @@ def test_a_demonstration_or_an_expert_may_be_given_by_its_path(made, tmp_path):
     Demonstration.load(tmp_path / "moved").save(place)
     assert find_demonstration(folder) is None
     (tmp_path / "expert").mkdir()
-    (tmp_path / "expert" / "result.json").write_text('{"config_hash": "ba9876543210"}')
+    (tmp_path / "expert" / "result.json").write_text(json.dumps(RESULT))
     assert len(find_demonstration(folder)) == 6
