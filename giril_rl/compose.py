@@ -68,8 +68,8 @@ class Composed:
             OmegaConf.resolve(self.node)
             built = OmegaConf.to_object(self.node)
         except (OmegaConfBaseException, RecursionError) as error:
-            key = getattr(error, "full_key", None)
-            where = f"{key}: " if key else "in ${...}: "
+            full_key = getattr(error, "full_key", None)
+            where = f"{full_key}: " if full_key else "in ${...}: "
             raise UserError(f"{where}{_first_line(error)}; write the value itself.") from error
         return apply_task_defaults(built, self.chosen)
 
@@ -182,7 +182,7 @@ def compose(recipe: Recipe, config: type[Any], texts: Sequence[str]) -> Composed
     overrides = parse(_with_task(texts))
     for override in overrides:
         check.override(override)
-    chosen = {group: default for group, (_, default) in found.items()}
+    chosen: dict[str, Any] = {group: default for group, (_, default) in found.items()}
     chosen |= {key: o.value() for o in overrides if (key := o.get_key_element()) in found}
     for group, choice in chosen.items():
         own = recipe.yaml.parent / group / f"{choice}.yaml"

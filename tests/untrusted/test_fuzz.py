@@ -46,7 +46,7 @@ def refused(error):
     assert sentence and sentence[-1] in ".?", sentence
 
 
-@here
+@settings(here, max_examples=40)
 @given(st.text(max_size=40))
 def test_words_are_parsed_or_refused(text):
     try:

@@ -51,7 +51,8 @@ def watched(here, monkeypatch):
     assert not Path("mark").exists() and "evil_module" not in sys.modules
     assert (here / "beside.txt").read_text() == "beside"
     for path in here.rglob("*"):
-        assert not path.is_file() or b"hunter2" not in path.read_bytes()
+        small = path.is_file() and path.stat().st_size < 2**25
+        assert not small or b"hunter2" not in path.read_bytes()
 
 
 def pickled(name):
@@ -290,6 +291,7 @@ def test_hydras_own_settings_in_a_task_do_nothing(here):
     main(group(content + "task: {name: a, env_id: None-v9}\n"))
 
 
+@pytest.mark.slow
 def test_a_study_s_status_leads_nowhere(here, capsys):
     run_folder()
     Path("studies/x").mkdir(parents=True)
