@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import csv
+import glob
 import io
 import json
 import os
+import shutil
 import sys
 from collections.abc import Iterable
 from importlib.metadata import PackageNotFoundError, version
@@ -27,6 +29,26 @@ def temporary_sibling(path: Path) -> Path:
         True
     """
     return path.with_name(f".{path.name}.{os.getpid()}.tmp")
+
+
+def remove_leftovers(path: Path) -> None:
+    """Remove what processes that were killed had prepared for ``path``, a file or a folder.
+
+    Only for whoever alone may write it, such as the holder of a lock.
+
+    Examples:
+        >>> import tempfile
+        >>> path = Path(tempfile.mkdtemp()) / "note.txt"
+        >>> temporary_sibling(path).touch()
+        >>> remove_leftovers(path)
+        >>> list(path.parent.iterdir())
+        []
+    """
+    for leftover in path.parent.glob(f".{glob.escape(path.name)}.*.tmp"):
+        if leftover.is_dir():
+            shutil.rmtree(leftover)
+        else:
+            leftover.unlink()
 
 
 def sync(path: Path) -> None:
@@ -63,11 +85,18 @@ def write_atomically(path: Path, content: bytes | str) -> None:
             file.flush()
             os.fsync(file.fileno())
         os.replace(temporary, path)
-    except BaseException:
+    except BaseException as error:
+        name_file(error, path)
         with contextlib.suppress(OSError):
             temporary.unlink()
         raise
     sync(path.parent)
+
+
+def name_file(error: BaseException, path: Path) -> None:
+    """Let an error of the disk say which file it is about, which a failed write does not."""
+    if isinstance(error, OSError) and error.filename is None:
+        error.filename = str(path)
 
 
 def write_json(path: Path, value: Any) -> None:

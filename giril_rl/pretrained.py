@@ -13,7 +13,7 @@ from torch import nn
 from torchrl.data import Bounded, Categorical, OneHot, TensorSpec, Unbounded
 
 from giril_rl.errors import UserError
-from giril_rl.files import installed_versions, read_json, write_json
+from giril_rl.files import installed_versions, read_json, remove_leftovers, write_json
 from giril_rl.formats import check_format
 
 FORMAT_VERSION = 1
@@ -96,6 +96,8 @@ class Pretrained:
             )
         assert isinstance(self, nn.Module)
         folder = Path(folder)
+        for name in (WEIGHTS, CARD):
+            remove_leftovers(folder / name)
         save_state(folder / WEIGHTS, dict(self.state_dict()))
         made_by = {
             "class": type(self).__name__,

@@ -22,6 +22,7 @@ from giril_rl.demos import Demonstration, check_demonstration, record_demonstrat
 from giril_rl.demos.task import as_recorded_task, spaces_of
 from giril_rl.envs import gym_factory, make_env, with_own_episodes
 from giril_rl.errors import UserError
+from giril_rl.files import remove_leftovers
 from giril_rl.naming import out_folder, safe, without_added
 from giril_rl.networks.agents import Agent
 from giril_rl.task_defaults import apply_task_defaults
@@ -164,6 +165,7 @@ def obtain_demonstration(
     task = as_recorded_task(cfg.task, demo.lives)
     folder = Path(cfg.root) / demonstration_place(cfg.task, demo, result["config_hash"])
     with made_once(folder, "demonstration"):
+        remove_leftovers(folder)
         if not folder.exists():
             agent = load_agent(source, cfg.task)
             recorded = record_demonstration(
