@@ -1,7 +1,8 @@
 """The command ``giril``: see the recipes, copy one, run one, evaluate a run.
 
-Exit codes: 0 done; 1 an error that is not the user's, with its traceback; 2 refused, in one
-sentence on standard error (``--traceback`` shows where); 130 interrupted. Torch, TorchRL and Hydra
+Exit codes: 0 done; 1 an error that is not the user's, with its traceback; 2 refused and 3 a run
+that could not go on (a full disk, a loss that is not a number), in one sentence on standard error
+(``--traceback`` shows where); 130 interrupted. Torch, TorchRL and Hydra
 are imported only by the commands that need them.
 """
 
@@ -15,7 +16,7 @@ from pathlib import Path
 
 from giril_rl import recipes
 from giril_rl.cli_parser import Parser as _Parser
-from giril_rl.errors import INTERRUPTED, UserError
+from giril_rl.errors import FAILED, INTERRUPTED, RunError, UserError, told
 from giril_rl.nearest import did_you_mean
 from giril_rl.places import check_place
 
@@ -203,12 +204,13 @@ def _usage() -> str:
 
 
 def _refuse(error: Exception, show_traceback: bool) -> int:
-    refused = isinstance(error, UserError)
-    if show_traceback or not refused:
+    sentence = told(error)
+    code = 2 if isinstance(sentence, UserError) else FAILED if isinstance(sentence, RunError) else 1
+    if show_traceback or code == 1:
         traceback.print_exception(error)
-    if refused:
-        print(f"giril: {error}", file=sys.stderr)
-    return 2 if refused else 1
+    if code != 1:
+        print(f"giril: {sentence}", file=sys.stderr)
+    return code
 
 
 def main(argv: Sequence[str] | None = None) -> int:

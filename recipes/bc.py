@@ -60,5 +60,4 @@ def main(cfg: Config, out: Path) -> None:
             method="bc",
             expert=expert,
             demo=demo,
-            seeds={"expert": cfg.expert.seed, "demo": cfg.demo.seed},
         )

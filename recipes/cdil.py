@@ -92,5 +92,5 @@ def main(cfg: Config, out: Path) -> None:
             expert=expert,
             demo=demo,
             reward=reward,
-            seeds={"reward": reward_seed, "expert": cfg.expert.seed, "demo": cfg.demo.seed},
+            seeds={"reward": reward_seed},
         )

@@ -91,5 +91,5 @@ def main(cfg: Config, out: Path) -> None:
             expert=expert,
             demo=demo,
             reward=reward,
-            seeds={"reward": reward_seed, "expert": cfg.expert.seed, "demo": cfg.demo.seed},
+            seeds={"reward": reward_seed},
         )

@@ -150,7 +150,7 @@ def test_a_recipe_leaves_a_whole_result(recipe, root, tmp_path, capsys):
 def test_continuous_actions_with_pybullet(root, tmp_path, capfd):
     """The shipped task; the expert's folder and demonstration are given by their paths."""
     task = "task=inverted_pendulum"
-    run("expert", tmp_path / "expert", root, task)
+    run("expert", tmp_path / "expert", root, task, "seed=3")
     more = [task, f"expert.path={tmp_path / 'expert'}", "demo.length=40"]
     result = run("giril", tmp_path / "giril", root, *more)
     assert_whole(tmp_path / "giril", result, "giril", "inverted_pendulum", 4 * BATCH)
@@ -159,6 +159,9 @@ def test_continuous_actions_with_pybullet(root, tmp_path, capfd):
     assert weights(tmp_path / "given") == weights(tmp_path / "giril")
     assert given["expert_return_mean"] is None
     assert given["demo_return_mean"] == result["demo_return_mean"]
+    # The seeds that it was made with, not those that another expert would have had.
+    seeds = {"policy": 0, "evaluation": 10_000, "reward": 0, "expert": 3, "demo": 0}
+    assert given["seeds"] == result["seeds"] == seeds
     assert "argv" not in capfd.readouterr().out
 
 

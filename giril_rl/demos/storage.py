@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import math
+import os
+import shutil
 from collections.abc import Collection
 from pathlib import Path
 from typing import Any
@@ -15,14 +18,29 @@ from giril_rl.files import sync
 from giril_rl.untrusted import check_memory, parse_json, read_text
 
 _DTYPES = ("float32", "int64", "bool")
+_PAGE = 4096
 _TENSORDICT = "<class 'tensordict._td.TensorDict'>"
 
 
 def save_tensors(folder: Path, transitions: TensorDict) -> None:
-    """Write ``transitions`` with ``TensorDict.memmap`` and wait for the disk."""
+    """Write ``transitions`` with ``TensorDict.memmap`` and wait for the disk.
+
+    Raises:
+        OSError: ENOSPC if there is not room for it.
+    """
+    _check_room(folder, transitions)
     transitions.detach().cpu().contiguous().memmap(folder, copy_existing=True)
     for path in sorted(folder.rglob("*"), reverse=True):
         sync(path)
+
+
+def _check_room(folder: Path, transitions: TensorDict) -> None:
+    # A disk that is full while a memory map is filled kills the process without a word.
+    tensors = list(transitions.values(include_nested=True, leaves_only=True))
+    needed = sum(x.numel() * x.element_size() + _PAGE for x in tensors)
+    place = next(parent for parent in folder.absolute().parents if parent.exists())
+    if shutil.disk_usage(place).free < needed:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(folder))
 
 
 def load_tensors(folder: Path, dtypes: Collection[str] = _DTYPES) -> TensorDict:

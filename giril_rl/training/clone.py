@@ -19,6 +19,7 @@ from giril_rl.networks.normalise import RunningNormaliser
 from giril_rl.networks.policy import NORMALISED
 from giril_rl.progress import progress
 from giril_rl.rewards.chunks import PIXELS_AT_ONCE
+from giril_rl.training.finite import Finite
 from giril_rl.training.interrupt import Interrupt, Interrupted
 from giril_rl.training.ppo import Trained
 from giril_rl.training.restoring import restoring
@@ -68,6 +69,7 @@ def clone_behaviour(
     Raises:
         UserError: if ``cfg.stop="held_out"`` has no pairs to look at.
         Interrupted: after a checkpoint, if the user asked for it with Ctrl-C.
+        RunError: if a loss is no longer finite; the last checkpoint stays.
     """
     if cfg.stop == "held_out" and (held_out is None or not len(held_out)):
         raise UserError(
@@ -95,6 +97,7 @@ def clone_behaviour(
             generator.set_state(saved["minibatches"])
     run.truncate_metrics(phase, step)
     began = time.perf_counter() - seconds
+    finite = Finite(run.folder, cfg.steps, "gradient steps")
 
     with Interrupt() as interrupt, progress(cfg.steps, step, "cloning") as bar:
         while step < cfg.steps:
@@ -111,7 +114,9 @@ def clone_behaviour(
                 weights = {k: v.clone() for k, v in agent.actor.state_dict().items()}
                 best = {"step": step, "loss": losses["held_out"], "actor": weights}
             bar.update(block, loss=f"{losses['fitted']:.3g}")
-            run.log(step, {f"{phase}/{k}/loss": v for k, v in losses.items()}, phase=phase)
+            metrics = {f"{phase}/{name}/loss": value for name, value in losses.items()}
+            run.log(step, metrics, phase=phase)
+            finite.losses(metrics, step)
             if step % CHECKPOINT_EVERY < block or step == cfg.steps or interrupt.requested:
                 seconds = time.perf_counter() - began
                 state = {

@@ -15,6 +15,7 @@ from giril_rl.rewards import (
     NoiseReward,
 )
 from giril_rl.training.fit import fit_reward
+from giril_rl.training.metrics import METRICS, read_metrics
 from giril_rl.training.reward_models import copy_reward, curiosity_reward, generative_reward
 from giril_rl.training.run import Run
 
@@ -35,12 +36,11 @@ def control_reward(
     """
     if demo is None:
         return ConstantReward(), {}
-    seeds = {"expert": cfg.expert.seed, "demo": cfg.demo.seed}
     if cfg.reward == "copy":
-        return copy_reward(cfg.giril, env, demo).to(cfg.device), seeds
+        return copy_reward(cfg.giril, env, demo).to(cfg.device), {}
     part = cfg.icm if cfg.reward == "untrained_icm" else cfg.giril
     seed = cfg.seed if part.seed is None else part.seed
-    seeds = {"reward": seed, **seeds}
+    seeds = {"reward": seed}
     if cfg.reward == "untrained_icm":
         return curiosity_reward(cfg.icm, env, demo, seed=seed).to(cfg.device), seeds
     reward = generative_reward(cfg.giril, env, demo, seed=seed).to(cfg.device)
@@ -57,8 +57,9 @@ def control_reward(
     if cfg.reward == "negated_giril":
         return AffineReward(reward, scale=-1.0), seeds
     mean, variance = moments(reward, demo)
-    run.truncate_metrics("moments", -1)
-    run.log(0, {"moments/mean": mean, "moments/variance": variance}, phase="moments")
+    # A resumed run has them already, before the rows that it continues.
+    if not any(row.get("phase") == "moments" for row in read_metrics(run.folder / METRICS)):
+        run.log(0, {"moments/mean": mean, "moments/variance": variance}, phase="moments")
     if cfg.reward == "centred_giril":
         return AffineReward(reward, shift=-mean), seeds
     return NoiseReward(mean, variance, seed=seed), seeds

@@ -13,6 +13,7 @@ from torchrl.objectives import LossModule
 from giril_rl.configs import FitConfig
 from giril_rl.progress import progress
 from giril_rl.rewards.chunks import PIXELS_AT_ONCE
+from giril_rl.training.finite import Finite
 from giril_rl.training.interrupt import Interrupt, Interrupted
 from giril_rl.training.randomness import restore_rng, rng_state, seeded
 from giril_rl.training.restoring import restoring
@@ -50,6 +51,7 @@ def fit_reward(
 
     Raises:
         Interrupted: after a checkpoint, if the user asked for it with Ctrl-C.
+        RunError: if a loss is no longer finite; the last checkpoint stays.
     """
     keys = loss.in_keys
     gradients = TracedGradients(loss, keys=keys)
@@ -71,6 +73,7 @@ def fit_reward(
             restore_rng(saved["rng"])
     run.truncate_metrics(phase, step)
     began = time.perf_counter() - seconds
+    finite = Finite(run.folder, cfg.steps, "fitting steps")
     with Interrupt() as interrupt, progress(cfg.steps, step, "reward model") as bar:
         while step < cfg.steps:
             block = min(cfg.log_every - step % cfg.log_every, cfg.steps - step)
@@ -82,7 +85,9 @@ def fit_reward(
                 optimizer.step()
             step += block
             bar.update(block)
-            run.log(step, _evaluate(loss, {"fitted": data, "held_out": held_out}), phase=phase)
+            losses = _evaluate(loss, {"fitted": data, "held_out": held_out})
+            run.log(step, losses, phase=phase)
+            finite.losses(losses, step)
             if step % CHECKPOINT_EVERY < block or step == cfg.steps or interrupt.requested:
                 state = {
                     "step": step,

@@ -11,9 +11,11 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 from giril_rl.errors import UserError
-from giril_rl.files import write_atomically
+from giril_rl.files import name_file, write_atomically
 from giril_rl.untrusted import parse_json
 
+METRICS = "metrics.jsonl"
+"""The file of a run's folder that has them."""
 LoggerName = Literal["tensorboard", "csv", "wandb", "mlflow"]
 
 
@@ -64,8 +66,12 @@ class MetricsFile:
         for key, value in values.items():
             number = float(value)
             row[key] = number if math.isfinite(number) else None
-        with open(self.path, "a", encoding="utf-8") as file:
-            file.write(json.dumps(row) + "\n")
+        try:
+            with open(self.path, "a", encoding="utf-8") as file:
+                file.write(json.dumps(row) + "\n")
+        except OSError as error:
+            name_file(error, self.path)
+            raise
 
     def truncate(self, phase: str, step: int) -> None:
         """Drop the rows of ``phase`` later than ``step``, and a line that a kill cut short."""

@@ -20,6 +20,7 @@ from giril_rl.errors import UserError
 from giril_rl.networks.agents import Agent
 from giril_rl.progress import progress
 from giril_rl.training.episodes import EpisodeTracker
+from giril_rl.training.finite import Finite
 from giril_rl.training.interrupt import Interrupt, Interrupted
 from giril_rl.training.randomness import restore_rng, rng_state
 from giril_rl.training.restoring import restoring
@@ -82,6 +83,7 @@ def train_ppo(
 
     Raises:
         Interrupted: after a checkpoint, if the user asked for it with Ctrl-C.
+        RunError: if a loss or a weight is no longer finite; the last checkpoint stays.
     """
     relabel.to(agent.device)
     learner = PPOLearner(agent, cfg, total_steps=steps, termination=termination)
@@ -120,6 +122,7 @@ def train_ppo(
     run.truncate_metrics(phase, taken)
     next_save = (taken // cfg.checkpoint_every + 1) * cfg.checkpoint_every
     stopped = False
+    finite = Finite(run.folder, steps)
     true_return = "?"
     began = time.perf_counter() - (0.0 if saved is None else saved["seconds"])
 
@@ -149,10 +152,12 @@ def train_ppo(
                 true_return = f"{metrics['train/return_mean']:,.1f}"
             bar.update(batch_size, true_return=true_return)
             run.log(taken, metrics, phase=phase)
+            finite.losses({**learned, **losses}, taken)
             if stop_at is not None and len(recent) == recent.maxlen:
                 stopped = sum(recent) / len(recent) >= stop_at
             if taken >= next_save or taken >= steps or stopped or interrupt.requested:
                 next_save += cfg.checkpoint_every
+                finite.weights(parts, taken)
                 state = {
                     "steps": taken,
                     "seconds": time.perf_counter() - began,

@@ -61,7 +61,7 @@ def finish_run(
         method: the method's name in tables.
         expert: the expert's result, if there was one.
         demo: the demonstration, if there was one.
-        seeds: seeds besides those of policy and evaluation.
+        seeds: seeds besides those of policy, evaluation, expert and demonstration.
         reward: the reward module, if there is one; kept beside the policy if it can be.
 
     Returns:
@@ -75,7 +75,12 @@ def finish_run(
         "horizon": cfg.task.horizon,
         "termination": cfg.termination,
         "seed": cfg.seed,
-        "seeds": {"policy": cfg.seed, "evaluation": cfg.eval.seed, **(seeds or {})},
+        "seeds": {
+            "policy": cfg.seed,
+            "evaluation": cfg.eval.seed,
+            **(seeds or {}),
+            **_seeds_of(demo),
+        },
         "env_steps": trained.steps,
         **scores,
         "wall_seconds": trained.seconds,
@@ -109,6 +114,15 @@ def finish_run(
         )
     run.finish(result)
     return result
+
+
+def _seeds_of(demo: Demonstration | None) -> dict[str, int | None]:
+    """Seeds of a demonstration and of who played it; None where it does not say."""
+    if demo is None:
+        return {}
+    player = demo.card.get("expert")
+    seed = player.get("seed") if isinstance(player, dict) else None
+    return {"expert": seed, "demo": demo.card.get("seed")}
 
 
 def _mean_return(demo: Demonstration) -> float:

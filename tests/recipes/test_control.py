@@ -47,6 +47,12 @@ def weights(folder):
     return {name: value.tolist() for name, value in state.items()}
 
 
+def rows(folder):
+    """Metrics less what a clock says, in their order."""
+    found = read_metrics(folder / "metrics.jsonl")
+    return [{k: v for k, v in row.items() if "seconds" not in k} for row in found]
+
+
 def first_batch(folder):
     """The mean reward of the first batch, which an untrained policy played."""
     rows = [row for row in read_metrics(folder / "metrics.jsonl") if row["phase"] == "ppo"]
@@ -145,6 +151,7 @@ def test_a_run_that_died_ends_as_an_undisturbed_one(words, root, tmp_path, monke
     assert load_state(tmp_path / "run" / "ppo.safetensors")["steps"] == 128
     run(recipe, tmp_path / "run", root, *more)
     assert weights(tmp_path / "run") == weights(tmp_path / "whole")
+    assert rows(tmp_path / "run") == rows(tmp_path / "whole")
 
 
 @pytest.mark.parametrize(
