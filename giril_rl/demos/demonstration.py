@@ -16,7 +16,7 @@ from giril_rl.demos.check import check_demonstration
 from giril_rl.demos.frames import FRAMES_FILE, load_frames, save_frames
 from giril_rl.demos.storage import load_tensors, save_tensors
 from giril_rl.errors import UserError
-from giril_rl.files import read_json, temporary_sibling, write_json
+from giril_rl.files import name_file, read_json, temporary_sibling, write_json
 from giril_rl.formats import check_format
 
 FORMAT_VERSION = 1
@@ -126,7 +126,8 @@ class Demonstration:
             save_tensors(temporary / "transitions", data)
             write_json(temporary / "card.json", card)
             temporary.replace(folder)
-        except BaseException:
+        except BaseException as error:
+            name_file(error, folder)
             shutil.rmtree(temporary, ignore_errors=True)
             raise
 
