@@ -95,7 +95,7 @@ def write_atomically(path: Path, content: bytes | str) -> None:
 
 def name_file(error: BaseException, path: Path) -> None:
     """Let an error of the disk say which file it is about, which a failed write does not."""
-    if isinstance(error, OSError) and error.filename is None:
+    if isinstance(error, OSError) and error.errno is not None and error.filename is None:
         error.filename = str(path)
 
 
