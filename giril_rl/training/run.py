@@ -13,10 +13,10 @@ import yaml
 from filelock import FileLock, Timeout
 
 from giril_rl.errors import UserError
-from giril_rl.files import installed_versions, read_json, write_atomically, write_json
+from giril_rl.files import installed_versions, name_file, read_json, write_atomically, write_json
 from giril_rl.formats import RUN_FORMAT, check_run_format
 from giril_rl.naming import NO_EFFECT, without_added
-from giril_rl.places import cannot_write, check_place
+from giril_rl.places import check_place
 from giril_rl.schema import flat
 from giril_rl.training.checkpoint import load_state, save_state
 from giril_rl.training.metrics import MetricsFile, check_logger, make_logger
@@ -101,8 +101,6 @@ class Run:
                 f"{run.folder} is in use by another process: wait for it to end, "
                 "or choose another out=."
             ) from None
-        except OSError as error:
-            raise cannot_write(run.folder, "out=", error) from None
         try:
             for leftover in run.folder.glob(".*.tmp"):
                 leftover.unlink()
@@ -126,10 +124,14 @@ class Run:
         self._metrics.write(phase, step, values)
         if self._logger_name is None:
             return
-        if self._logger is None:
-            self._logger = make_logger(self._logger_name, self.folder)  # type: ignore[arg-type]
-        for key, value in values.items():
-            self._logger.log_scalar(key, float(value), step=step)
+        try:
+            if self._logger is None:
+                self._logger = make_logger(self._logger_name, self.folder)  # type: ignore[arg-type]
+            for key, value in values.items():
+                self._logger.log_scalar(key, float(value), step=step)
+        except OSError as error:
+            name_file(error, self.folder)
+            raise
 
     def truncate_metrics(self, phase: str, step: int) -> None:
         """Forget the rows of ``phase`` later than ``step``, before continuing from there.

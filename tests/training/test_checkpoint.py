@@ -44,7 +44,7 @@ def same(left, right):
         torch.empty(0, 3),
         torch.arange(12.0).reshape(3, 4).t()[1:],
         torch.tensor(2.0).expand(3, 2),
-        torch.randn(3).bfloat16(),
+        torch.tensor([0.1, -2.0, 3.7]).bfloat16(),
     ],
     ids=str,
 )
@@ -114,7 +114,7 @@ def test_training_continues_as_if_never_stopped(tmp_path):
     assert same(dict(module.state_dict()), dict(other.state_dict()))
 
 
-@pytest.mark.parametrize("value", [object(), {1, 2}, {(1,): 2}, b"bytes"], ids=str)
+@pytest.mark.parametrize("value", [1j, {1, 2}, {(1,): 2}, b"bytes"], ids=str)
 def test_other_values_are_a_programming_error_and_leave_the_old_file(tmp_path, value):
     path = tmp_path / "a.safetensors"
     save_state(path, {"step": 1})
