@@ -57,6 +57,8 @@ class AtariEnv(BatchedEnv):
         (torch.Size([2, 5, 4, 84, 84]), torch.uint8)
     """
 
+    has_threads = True
+
     def __init__(
         self,
         game: str,

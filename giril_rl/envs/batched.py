@@ -31,6 +31,9 @@ class BatchedEnv(EnvBase):
     _onward_key = "observation"
     """Entry of ``next`` from which a simulator goes on whose episode has not ended."""
 
+    has_threads = False
+    """Whether the simulators run in threads of their own."""
+
     _last_observation: np.ndarray
 
     def __init__(self, num_envs: int, *, seed: int = 0) -> None:

@@ -12,10 +12,12 @@ from torchrl.envs.utils import ExplorationType, exploration_type
 
 from giril_rl.networks.distributions import CategoricalActions
 from giril_rl.networks.pixels import flat_frames
-from giril_rl.networks.space_to_depth import SpaceToDepthConv
+from giril_rl.networks.space_to_depth import SpaceToDepthConv, deal
 from giril_rl.pretrained import Pretrained, remembered
 
 HIDDEN = "hidden"
+DEALT = "dealt"
+STRIDE = 4
 
 
 class PixelActorCritic(Pretrained, nn.Module):
@@ -42,7 +44,7 @@ class PixelActorCritic(Pretrained, nn.Module):
 
     discrete = True
     log_std = None
-    input_keys: tuple[str, ...] = ("observation",)
+    input_keys: tuple[str, ...] = (DEALT,)
     """What the networks in PPO's loss read of a minibatch."""
 
     @remembered
@@ -68,11 +70,13 @@ class PixelActorCritic(Pretrained, nn.Module):
         return CategoricalActions(self.actor.head(hidden)), self.critic(hidden)
 
     def value_network(self) -> None:
-        """None: the acting policy has written the values, and :meth:`look_ahead` the next ones."""
+        """None: the acting policy has written the values, and :meth:`prepare` the next ones."""
 
     @torch.no_grad()
-    def look_ahead(self, batch: TensorDictBase, following: Tensor) -> None:
+    def prepare(self, batch: TensorDictBase, following: Tensor) -> None:
         """Writes the value of what follows each step, which mostly is that of the next one.
+
+        And the frames as the networks in PPO's loss take them, which all epochs share.
 
         Args:
             batch: what the acting policy collected, ``(num_envs, time)``, with ``"state_value"``.
@@ -84,6 +88,7 @@ class PixelActorCritic(Pretrained, nn.Module):
         alone[:, -1] = True
         after[alone] = self.critic(self.hidden(following[alone]))
         batch.set(("next", "state_value"), after)
+        batch.set(DEALT, self.actor.deal(batch.get("observation")))
 
     def update_normaliser(self, observation: Tensor) -> None:
         """Does nothing: frames are divided by a constant."""
@@ -117,7 +122,7 @@ class PixelActor(nn.Module):
         super().__init__()
         self.channels = channels
         self.trunk = nn.Sequential(
-            SpaceToDepthConv(channels, 32, 8, stride=4),
+            SpaceToDepthConv(channels, 32, 8, stride=STRIDE),
             nn.ReLU(),
             nn.Conv2d(32, 64, 4, stride=2),
             nn.ReLU(),
@@ -133,11 +138,18 @@ class PixelActor(nn.Module):
                 _orthogonal(layer, math.sqrt(2))
         _orthogonal(self.head, 0.01)
 
+    def deal(self, observation: Tensor) -> Tensor:
+        """Frames ``(*batch, channels, 84, 84)`` as the trunk takes them, see :func:`deal`."""
+        dealt = deal(flat_frames(observation, self.channels), STRIDE)
+        return dealt.reshape(*observation.shape[:-3], *dealt.shape[1:])
+
     def hidden(self, observation: Tensor) -> Tensor:
         """The trunk's output ``(*batch, 512)`` for uint8 frames ``(*batch, channels, 84, 84)``."""
-        return self.trunk(flat_frames(observation, self.channels)).reshape(
-            *observation.shape[:-3], 512
-        )
+        return self.hidden_of_dealt(self.deal(observation))
+
+    def hidden_of_dealt(self, dealt: Tensor) -> Tensor:
+        """The same for what :meth:`deal` returned."""
+        return self.trunk(dealt.reshape(-1, *dealt.shape[-3:])).reshape(*dealt.shape[:-3], 512)
 
     def forward(self, observation: Tensor) -> Tensor:
         """The logits ``(*batch, actions)``."""
@@ -175,7 +187,7 @@ class PixelLossActor(TensorDictModuleBase):
 
     def __init__(self, agent: PixelActorCritic) -> None:
         super().__init__()
-        self.in_keys = ["observation"]
+        self.in_keys = [DEALT]
         self.out_keys = ["action", HIDDEN]
         self.agent = agent
 
@@ -185,7 +197,7 @@ class PixelLossActor(TensorDictModuleBase):
         Writes ``"hidden"`` into ``tensordict``, which in the loss is its own shallow copy of the
         minibatch, the one that the critic gets next.
         """
-        hidden = self.agent.hidden(tensordict.get("observation"))
+        hidden = self.agent.actor.hidden_of_dealt(tensordict.get(DEALT))
         tensordict.set(HIDDEN, hidden)
         return CategoricalActions(self.agent.actor.head(hidden))
 

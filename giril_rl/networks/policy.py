@@ -83,7 +83,7 @@ class ActorCritic(Pretrained, nn.Module):
         """What advantages have the values computed by, in a batch and where it leads to."""
         return self.critic_for_loss()
 
-    def look_ahead(self, batch: TensorDictBase, following: Tensor) -> None:
+    def prepare(self, batch: TensorDictBase, following: Tensor) -> None:
         """Writes into ``batch`` what :meth:`value_network` reads of where each step leads to.
 
         Args:

@@ -16,7 +16,8 @@ class SpaceToDepthConv(nn.Conv2d):
     channels are few. Dealt out in blocks of the stride, the frames have 64 channels, and the same
     sum is a 2x2 convolution of stride 1. Weights keep ``Conv2d``'s shape and names, and the numbers
     are those of ``conv(frames / 255)`` to rounding. PPO's update of the whole network takes 0.6 of
-    the time (``tests/benchmarks/atari_training.py`` has the loop).
+    the time (``tests/benchmarks/atari_training.py`` has the loop). Frames that are used many times
+    are dealt out once.
 
     Args:
         in_channels: frames in an observation.
@@ -29,7 +30,7 @@ class SpaceToDepthConv(nn.Conv2d):
         >>> frames = torch.randint(0, 256, (2, 4, 84, 84), dtype=torch.uint8)
         >>> conv = SpaceToDepthConv(4, 32, 8, stride=4)
         >>> plain = F.conv2d(frames / 255, conv.weight, conv.bias, stride=4)
-        >>> torch.allclose(conv(frames), plain, atol=1e-5)
+        >>> torch.allclose(conv(deal(frames, 4)), plain, atol=1e-5)
         True
     """
 
@@ -43,21 +44,24 @@ class SpaceToDepthConv(nn.Conv2d):
             )
         self.block = stride
 
-    def forward(self, frames: Tensor) -> Tensor:
-        """``(N, out_channels, ...)`` for frames of bytes ``(N, in_channels, height, width)``."""
+    def forward(self, dealt: Tensor) -> Tensor:
+        """``(N, out_channels, ...)`` for frames that :func:`deal` dealt out by the stride."""
         out, side = self.out_channels, self.weight.shape[-1]
         blocks = side // self.block
         weight = (self.weight / 255).unflatten(3, (blocks, -1)).unflatten(2, (blocks, -1))
         weight = weight.permute(0, 1, 3, 5, 2, 4).reshape(out, -1, blocks, blocks)
-        dealt = _dealt(frames, self.block).to(weight.dtype).permute(0, 3, 1, 2)
-        return F.conv2d(dealt, weight, self.bias)
+        return F.conv2d(dealt.to(weight.dtype).permute(0, 3, 1, 2), weight, self.bias)
 
 
-def _dealt(frames: Tensor, block: int) -> Tensor:
+def deal(frames: Tensor, block: int) -> Tensor:
     """Bytes ``(N, c, h, w)`` as ``(N, h / block, w / block, c * block * block)``.
 
     Channels last in memory, which is what the convolution wants. A block's row is moved as one
     word, and bytes are moved rather than floats: each is a fourth of the work.
+
+    Examples:
+        >>> deal(torch.zeros(2, 4, 84, 84, dtype=torch.uint8), 4).shape
+        torch.Size([2, 21, 21, 64])
     """
     words = frames.contiguous().view(_WORDS[block]) if block in _WORDS else None
     if words is None:

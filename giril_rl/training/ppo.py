@@ -24,6 +24,7 @@ from giril_rl.training.finite import Finite
 from giril_rl.training.interrupt import Interrupt, Interrupted
 from giril_rl.training.randomness import restore_rng, rng_state
 from giril_rl.training.restoring import restoring
+from giril_rl.training.threads import made_on_one_thread
 from giril_rl.training.traced import TracedGradients
 
 if TYPE_CHECKING:
@@ -132,7 +133,7 @@ def train_ppo(
         progress(steps, taken, phase) as bar,
     ):
         stack.callback(collector.shutdown)
-        for batch in collector:
+        for batch in made_on_one_thread(collector) if env.has_threads else collector:
             started = time.perf_counter()
             returns, lengths = tracker(batch)
             recent.extend(returns.tolist())
@@ -253,7 +254,7 @@ class PPOLearner:
             following = batch.get(("next", "following_observation"), None)
             if following is None:
                 following = batch.get(("next", "observation"))
-            self.agent.look_ahead(batch, following)
+            self.agent.prepare(batch, following)
             if self.bootstraps_failure:
                 failed = batch.get(("next", "terminated"))
                 batch.set(("next", NO_FAILURE), torch.zeros_like(failed))

@@ -109,11 +109,13 @@ def test_deterministic_mode_is_the_most_likely_action(agent):
     assert torch.equal(actions, logits.argmax(-1))
     drawn = torch.stack([policy(data.clone())["action"] for _ in range(5)])
     assert (drawn != actions).any()
+    data["dealt"] = agent.actor.deal(data["observation"])
     assert torch.equal(agent.actor_for_loss()(data)["action"], actions)
 
 
 def minibatch(agent, size=6):
     data = agent.acting()(observe(size))
+    data["dealt"] = agent.actor.deal(data["observation"])
     data["action_log_prob"] += 0.2 * torch.randn(size)  # some ratios are clipped, some are not
     data["state_value"] += 0.2 * torch.randn(size, 1)
     data["advantage"] = torch.randn(size, 1)

@@ -105,7 +105,7 @@ def test_the_trunk_sees_only_what_it_has_not_seen(agent):
     data = collected(agent)
     sizes = []
     agent.actor.trunk.register_forward_hook(lambda _, inputs, out: sizes.append(len(out)))
-    agent.look_ahead(data, data["next", "observation"])
+    agent.prepare(data, data["next", "observation"])
     # Two ends and a running episode, two ends of which one is the batch's, a running episode.
     assert sizes == [3 + 2 + 1]
 
@@ -114,7 +114,7 @@ def test_what_follows_an_unnoticed_reset_is_given_apart(agent):
     data = collected(agent)
     following = data["next", "observation"].clone()
     following[0, 2] = frames()
-    agent.look_ahead(data, following)
+    agent.prepare(data, following)
     with torch.no_grad():
         expected = agent.critic(agent.hidden(following[0, 2]))
     torch.testing.assert_close(data["next", "state_value"][0, 2], expected)
