@@ -1,3 +1,4 @@
+import errno
 import json
 import os
 import pickle
@@ -57,6 +58,16 @@ def test_nothing_is_overwritten_or_left_half_done(demo, folder, monkeypatch):
     with pytest.raises(OSError, match="disk full"):
         demo.save(folder.parent / "other")
     assert os.listdir(folder.parent) == ["demo"]
+
+
+def test_nothing_is_begun_where_there_is_no_room(demo, tmp_path, monkeypatch):
+    """A disk that fills up under a memory map would end the process without a word."""
+    room = shutil.disk_usage(tmp_path)
+    monkeypatch.setattr(shutil, "disk_usage", lambda place: room._replace(free=100))
+    with pytest.raises(OSError, match="No space left") as raised:
+        demo.save(tmp_path / "demo")
+    assert raised.value.errno == errno.ENOSPC and "demo" in raised.value.filename
+    assert not os.listdir(tmp_path)
 
 
 def test_unsound_demonstration_is_not_saved(demo, tmp_path):

@@ -141,6 +141,12 @@ def test_too_large_a_step_size(nursery, tmp_path):
     assert not list((tmp_path / "expert").glob("*.safetensors"))
 
 
+def test_a_discriminator_that_leaves_the_numbers(nursery, tmp_path):
+    sentence = only_sentence(nursery.run(words("gail", tmp_path, reward__lr="1e38")))
+    assert "discriminator/loss_" in sentence and " at 128 of 256 steps: " in sentence
+    assert not list((tmp_path / "gail").glob("*.safetensors"))
+
+
 def test_fits_that_leave_the_numbers(tmp_path):
     env = make_env(TASK, 1, 0)
     played = record_demonstration(
