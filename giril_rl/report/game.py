@@ -12,8 +12,8 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 
 from giril_rl.configs import TaskConfig
 from giril_rl.envs import AtariEnv, make_env
+from giril_rl.randomness import seeded
 from giril_rl.training.evaluate import Player
-from giril_rl.training.randomness import seeded
 
 MOST_STEPS = 2_000
 
@@ -70,7 +70,7 @@ def play_game(agent: Player, task: TaskConfig, *, seed: int, most: int = MOST_ST
     played: list[TensorDictBase] = []
     score, lives = [], []
     with (
-        seeded(seed, torch.device("cpu")),
+        seeded(seed),
         torch.no_grad(),
         set_exploration_type(ExplorationType.RANDOM),
     ):

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-import torch
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.data import TensorSpec
@@ -14,6 +13,7 @@ from giril_rl.networks.joined import JoinedSequential
 from giril_rl.networks.pixel_discriminators import PixelBottleneck
 from giril_rl.networks.vectors import mlp
 from giril_rl.pretrained import remembered
+from giril_rl.randomness import seeded
 from giril_rl.rewards.actions import ActionEncoder
 from giril_rl.rewards.adversarial import RewardForm
 from giril_rl.rewards.discriminator import (
@@ -84,8 +84,7 @@ class BottleneckReward(DiscriminatorReward):
             UserError: for an unknown form, rule or kind of action.
         """
         actions = ActionEncoder(action_spec)
-        with torch.random.fork_rng(devices=[]):
-            torch.default_generator.manual_seed(seed)
+        with seeded(seed):
             encoder = JoinedSequential(*mlp(observation_dim + actions.size, 2 * latent, hidden))
             head = nn.Linear(latent, 1)
         return cls(
@@ -126,8 +125,7 @@ class BottleneckReward(DiscriminatorReward):
             UserError: for an unknown form or kind of action.
         """
         actions = ActionEncoder(action_spec)
-        with torch.random.fork_rng(devices=[]):
-            torch.default_generator.manual_seed(seed)
+        with seeded(seed):
             encoder = PixelBottleneck(actions.size, latent, channels)
             head = nn.Linear(latent, 1)
         return cls(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase, dispatch
 from tensordict.utils import NestedKey
@@ -15,6 +14,7 @@ from giril_rl.networks.joined import JoinedSequential
 from giril_rl.networks.pixels import ForwardModel, InverseModel, PixelFeatures
 from giril_rl.networks.vectors import mlp
 from giril_rl.pretrained import Pretrained, remembered
+from giril_rl.randomness import seeded
 from giril_rl.rewards.actions import ActionEncoder
 from giril_rl.rewards.chunks import per_transition
 from giril_rl.rewards.keys import REWARD_KEYS, TRANSITION_KEYS, check_keys
@@ -133,8 +133,7 @@ class CuriosityReward(Pretrained, TensorDictModuleBase):
         """
         actions = ActionEncoder(action_spec)
         size = hidden[-1] if hidden else observation_dim
-        with torch.random.fork_rng(devices=[]):
-            torch.default_generator.manual_seed(seed)
+        with seeded(seed):
             features: nn.Module = nn.Identity()
             if hidden:
                 features = nn.Sequential(*mlp(observation_dim, size, hidden[:-1]), nn.Tanh())
@@ -180,8 +179,7 @@ class CuriosityReward(Pretrained, TensorDictModuleBase):
             UserError: for an unknown kind of action.
         """
         actions = ActionEncoder(action_spec)
-        with torch.random.fork_rng(devices=[]):
-            torch.default_generator.manual_seed(seed)
+        with seeded(seed):
             features = PixelFeatures(channels)
             inverse_model, forward_model = InverseModel(actions.size), ForwardModel(actions.size)
         return cls(

@@ -18,6 +18,7 @@ from giril_rl.networks.normalise import RunningNormaliser
 from giril_rl.networks.pixel_discriminators import PixelDiscriminator
 from giril_rl.networks.vectors import mlp
 from giril_rl.pretrained import Pretrained, remembered
+from giril_rl.randomness import seeded
 from giril_rl.rewards.actions import ActionEncoder
 from giril_rl.rewards.adversarial import RewardForm, adversarial_reward
 from giril_rl.rewards.chunks import per_transition
@@ -108,8 +109,7 @@ class DiscriminatorReward(Pretrained, TensorDictModuleBase):
             UserError: for an unknown form, rule or kind of action.
         """
         actions = ActionEncoder(action_spec)
-        with torch.random.fork_rng(devices=[]):
-            torch.default_generator.manual_seed(seed)
+        with seeded(seed):
             network = JoinedSequential(*mlp(observation_dim + actions.size, 1, hidden))
         return cls(
             network,
@@ -146,8 +146,7 @@ class DiscriminatorReward(Pretrained, TensorDictModuleBase):
             UserError: for an unknown form or kind of action.
         """
         actions = ActionEncoder(action_spec)
-        with torch.random.fork_rng(devices=[]):
-            torch.default_generator.manual_seed(seed)
+        with seeded(seed):
             network = PixelDiscriminator(actions.size, channels=channels)
         return cls(
             network,

@@ -18,6 +18,7 @@ from giril_rl.networks.pixel_decoder import PixelDecoder
 from giril_rl.networks.pixels import PixelEncoder, PixelPrior
 from giril_rl.networks.vectors import mlp
 from giril_rl.pretrained import Pretrained, remembered
+from giril_rl.randomness import seeded
 from giril_rl.rewards.action_table import ActionTable
 from giril_rl.rewards.actions import ActionEncoder
 from giril_rl.rewards.chunks import per_transition
@@ -142,8 +143,7 @@ class GenerativeReward(Pretrained, TensorDictModuleBase):
             raise UserError(f"prior={prior!r} is unknown: choose standard or conditional.")
         actions = ActionEncoder(action_spec)
         d, k = observation_dim, actions.size
-        with torch.random.fork_rng(devices=[]):
-            torch.default_generator.manual_seed(seed)
+        with seeded(seed):
             encoder = JoinedSequential(*mlp(2 * d, 2 * k, hidden))
             decoder = JoinedSequential(*mlp(k + d, d, hidden))
             prior_network = mlp(d, 2 * k, hidden) if prior == "conditional" else None
@@ -194,8 +194,7 @@ class GenerativeReward(Pretrained, TensorDictModuleBase):
         if prior not in get_args(Prior):
             raise UserError(f"prior={prior!r} is unknown: choose standard or conditional.")
         actions = ActionEncoder(action_spec)
-        with torch.random.fork_rng(devices=[]):
-            torch.default_generator.manual_seed(seed)
+        with seeded(seed):
             encoder = PixelEncoder(actions.size, channels)
             decoder = PixelDecoder(actions.size, channels)
             prior_network = PixelPrior(actions.size, channels) if prior == "conditional" else None

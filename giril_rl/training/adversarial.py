@@ -9,9 +9,9 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from giril_rl.configs import AdversarialConfig
+from giril_rl.randomness import restore_rng, rng_state, seeded
 from giril_rl.rewards.bottleneck_loss import BottleneckLoss
 from giril_rl.rewards.discriminator_loss import DiscriminatorLoss
-from giril_rl.training.randomness import restore_rng, rng_state, seeded
 from giril_rl.training.traced import TracedGradients
 
 

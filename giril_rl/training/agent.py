@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import torch
-
 from giril_rl.configs import PPOConfig, TaskConfig
 from giril_rl.envs import BatchedEnv, make_env
 from giril_rl.errors import UserError
 from giril_rl.networks.agents import Agent, agent_for, fits, load_agent_from
-from giril_rl.training.randomness import seeded
+from giril_rl.randomness import seeded
 
 POLICY = "policy"
 """The folder of a run that holds its policy, see :class:`giril_rl.pretrained.Pretrained`."""
@@ -25,7 +23,7 @@ def make_agent(env: BatchedEnv, cfg: PPOConfig, seed: int) -> Agent:
         >>> make_agent(env, PPOConfig(), seed=0).critic(torch.zeros(1, 4)).shape
         torch.Size([1, 1])
     """
-    with seeded(seed, torch.device("cpu")):
+    with seeded(seed):
         return agent_for(env, hidden=cfg.hidden, normalise=cfg.normalise_observations)
 
 

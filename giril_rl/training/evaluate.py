@@ -13,7 +13,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from giril_rl.configs import TaskConfig
 from giril_rl.envs import for_scores, make_env
-from giril_rl.training.randomness import seeded
+from giril_rl.randomness import seeded
 
 
 class Player(Protocol):

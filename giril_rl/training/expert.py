@@ -25,11 +25,11 @@ from giril_rl.errors import UserError
 from giril_rl.files import remove_leftovers
 from giril_rl.naming import out_folder, safe, without_added
 from giril_rl.networks.agents import Agent
+from giril_rl.randomness import check_device
 from giril_rl.task_defaults import apply_task_defaults
 from giril_rl.training.agent import load_agent, make_agent
 from giril_rl.training.finished import read_result
 from giril_rl.training.ppo import train_ppo
-from giril_rl.training.randomness import check_device
 from giril_rl.training.result import finish_run
 from giril_rl.training.run import Run
 from giril_rl.training.scaling import return_scaling

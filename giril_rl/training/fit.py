@@ -12,10 +12,10 @@ from torchrl.objectives import LossModule
 
 from giril_rl.configs import FitConfig
 from giril_rl.progress import progress
+from giril_rl.randomness import restore_rng, rng_state, seeded
 from giril_rl.rewards.chunks import PIXELS_AT_ONCE
 from giril_rl.training.finite import Finite
 from giril_rl.training.interrupt import Interrupt, Interrupted
-from giril_rl.training.randomness import restore_rng, rng_state, seeded
 from giril_rl.training.restoring import restoring
 from giril_rl.training.traced import TracedGradients
 

@@ -19,10 +19,10 @@ from giril_rl.envs import BatchedEnv
 from giril_rl.errors import UserError
 from giril_rl.networks.agents import Agent
 from giril_rl.progress import progress
+from giril_rl.randomness import restore_rng, rng_state
 from giril_rl.training.episodes import EpisodeTracker
 from giril_rl.training.finite import Finite
 from giril_rl.training.interrupt import Interrupt, Interrupted
-from giril_rl.training.randomness import restore_rng, rng_state
 from giril_rl.training.restoring import restoring
 from giril_rl.training.threads import made_on_one_thread
 from giril_rl.training.traced import TracedGradients

@@ -10,6 +10,8 @@ from torch import Tensor
 
 from giril_rl.errors import UserError
 
+CPU = torch.device("cpu")
+
 
 def rng_state(device: torch.device) -> dict[str, Tensor]:
     """The generators' states, for a checkpoint.
@@ -25,14 +27,14 @@ def rng_state(device: torch.device) -> dict[str, Tensor]:
 
 
 @contextmanager
-def seeded(seed: int, device: torch.device) -> Iterator[None]:
+def seeded(seed: int, device: torch.device = CPU) -> Iterator[None]:
     """Seeds the generators of the CPU and of ``device``, and puts them back afterwards.
 
     Examples:
         >>> state = torch.get_rng_state()
-        >>> with seeded(3, torch.device("cpu")):
+        >>> with seeded(3):
         ...     first = torch.rand(1)
-        >>> with seeded(3, torch.device("cpu")):
+        >>> with seeded(3):
         ...     bool(torch.rand(1) == first)
         True
         >>> torch.equal(torch.get_rng_state(), state)
