@@ -38,6 +38,7 @@ class BottleneckReward(DiscriminatorReward):
         **kwargs: those of :class:`~giril_rl.rewards.DiscriminatorReward`.
 
     Examples:
+        >>> import torch
         >>> from tensordict import TensorDict
         >>> from torchrl.data import Categorical
         >>> reward = BottleneckReward.for_vectors(2, Categorical(3), normalise="raw", latent=4)

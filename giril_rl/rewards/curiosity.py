@@ -32,6 +32,7 @@ def feature_error(predicted: Tensor, features: Tensor) -> Tensor:
         features: ``phi(s')``, of the same shape.
 
     Examples:
+        >>> import torch
         >>> feature_error(torch.tensor([[0.5, 1.0]]), torch.tensor([[0.5, -1.0]]))
         tensor([4.])
     """
@@ -63,6 +64,7 @@ class CuriosityReward(Pretrained, TensorDictModuleBase):
         UserError: for another number of keys.
 
     Examples:
+        >>> import torch
         >>> from tensordict import TensorDict
         >>> from torchrl.data import Bounded
         >>> reward = CuriosityReward.for_vectors(2, Bounded(-1, 1, shape=(1,)), normalise="raw")

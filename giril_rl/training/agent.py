@@ -18,6 +18,7 @@ def make_agent(env: BatchedEnv, cfg: PPOConfig, seed: int) -> Agent:
     """An untrained agent for ``env``, initialised from ``seed`` alone.
 
     Examples:
+        >>> import torch
         >>> from giril_rl.envs import make_env
         >>> env = make_env(TaskConfig(name="cartpole", env_id="CartPole-v1"), num_envs=1, seed=0)
         >>> make_agent(env, PPOConfig(), seed=0).critic(torch.zeros(1, 4)).shape
