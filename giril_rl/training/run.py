@@ -12,11 +12,11 @@ from typing import Any
 import yaml
 from filelock import FileLock, Timeout
 
-from giril_rl.errors import UserError
+from giril_rl.errors import UserError, told
 from giril_rl.files import installed_versions, name_file, read_json, write_atomically, write_json
 from giril_rl.formats import RUN_FORMAT, check_run_format
 from giril_rl.naming import NO_EFFECT, without_added
-from giril_rl.places import check_place
+from giril_rl.places import cannot_write, check_place
 from giril_rl.schema import flat
 from giril_rl.training.checkpoint import load_state, save_state
 from giril_rl.training.metrics import MetricsFile, check_logger, make_logger
@@ -101,6 +101,10 @@ class Run:
                 f"{run.folder} is in use by another process: wait for it to end, "
                 "or choose another out=."
             ) from None
+        except OSError as error:
+            if told(error) is not error:  # A disk that failed is no bad choice of a place.
+                raise
+            raise cannot_write(run.folder, "out=", error) from None
         try:
             for leftover in run.folder.glob(".*.tmp"):
                 leftover.unlink()

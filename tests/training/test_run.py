@@ -1,6 +1,9 @@
+import errno
 import json
+import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 import torch
@@ -50,6 +53,21 @@ def test_truncate_drops_only_later_rows_of_its_phase(tmp_path):
         run.log(1536, {"ppo/loss": 2.0}, phase="ppo")
     rows = [(row["phase"], row["step"]) for row in read_metrics(tmp_path / "metrics.jsonl")]
     assert rows == [("fit", 9000), ("ppo", 512), ("ppo", 1024), ("ppo", 1536)]
+
+
+@pytest.mark.parametrize(
+    ("code", "kind"),
+    [(errno.ENOENT, UserError), (errno.ENAMETOOLONG, UserError), (errno.EIO, OSError)],
+)
+def test_a_folder_that_the_system_will_not_make_is_refused(code, kind, tmp_path, monkeypatch):
+    """A bad choice of a place is the user's to correct; a disk that fails is told of as such."""
+
+    def refuse(path, *args, **kwargs):
+        raise OSError(code, os.strerror(code), str(path))
+
+    monkeypatch.setattr(Path, "mkdir", refuse)
+    with pytest.raises(kind, match=os.strerror(code)):
+        Run.open(tmp_path / "run", CONFIG, recipe="giril")
 
 
 def test_half_written_line_does_not_swallow_the_next(tmp_path):
