@@ -6,6 +6,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
+import torch
+
 from giril_rl.errors import UserError
 
 if TYPE_CHECKING:
@@ -25,6 +27,8 @@ def restoring(run: Run, phase: str) -> Iterator[None]:
     """
     try:
         yield
+    except torch.OutOfMemoryError:
+        raise  # A RuntimeError, and no reason to delete a checkpoint.
     except (KeyError, IndexError, AttributeError, TypeError, ValueError, RuntimeError) as error:
         raise UserError(
             f"{run.folder / phase}.safetensors is a checkpoint of another run or task: delete the "
