@@ -28,6 +28,8 @@ def check_place(folder: Path, key: str) -> None:
     try:
         there = folder
         while not (there.exists() or there.is_symlink()):
+            if there == there.parent:  # Such as a drive that is not there.
+                raise FileNotFoundError(f"there is no {there}")
             there = there.parent
         if there == folder and not there.is_dir():
             raise UserError(f"{folder} is a file: choose another {key}.")
