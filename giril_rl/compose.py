@@ -31,7 +31,8 @@ from giril_rl.untrusted import check_references, check_yaml, read_text
 
 SCHEMA = "recipe_schema"
 """The entry in a YAML's defaults list that stands for the recipe's own ``Config`` class."""
-_NAME = re.compile(r"\w[\w-]*")
+_GROUP = re.compile(r"\w[\w-]*")
+_CHOICE = re.compile(r"\w[\w.+-]*")
 
 
 @dataclass(frozen=True)
@@ -116,11 +117,18 @@ def _load_settings(recipe: Recipe) -> DictConfig:
 
 
 def _names_a_choice(entry: Any) -> bool:
-    """Whether an entry is ``group: choice``; paths, packages and Hydra's own groups are not."""
+    """Whether an entry is ``group: choice``; paths, packages and Hydra's own groups are not.
+
+    Nothing chosen, ``group: null``, is a choice as well.
+    """
     if not isinstance(entry, dict) or len(entry) != 1 or "hydra" in entry:
         return False
-    words = [word for pair in entry.items() for word in pair]
-    return all(isinstance(word, str) and _NAME.fullmatch(word) for word in words)
+    ((group, choice),) = entry.items()
+    return (
+        isinstance(group, str)
+        and _GROUP.fullmatch(group) is not None
+        and (choice is None or (isinstance(choice, str) and _CHOICE.fullmatch(choice) is not None))
+    )
 
 
 def groups(recipe: Recipe) -> dict[str, tuple[list[str], str]]:

@@ -229,3 +229,14 @@ def test_config_hash_tells_configurations_apart():
     assert config_hash(config_of("ppo.lr=0.1")) != config_hash(config)
     assert len(config_hash(config)) == 12
     assert set(config_hash(RunConfig())) <= set("0123456789abcdef")
+
+
+@pytest.mark.parametrize("default", ["cart-0.1", "null"])
+def test_a_default_may_have_a_dot_in_its_name_or_be_left_to_the_command_line(default, tmp_path):
+    copy(GIRIL, tmp_path / "mine.py")
+    (tmp_path / "task").mkdir()
+    (tmp_path / "task/cart-0.1.yaml").write_text("name: cart\nenv_id: CartPole-v1\n")
+    settings = f"defaults: [recipe_schema, {{task: {default}}}, _self_]\nsteps: 2000\n"
+    (tmp_path / "mine.yaml").write_text(settings)
+    texts = ["task=cart-0.1"] if default == "null" else []
+    assert resolved(find(str(tmp_path / "mine.py")), CONFIG, texts)[0].task.name == "cart"
