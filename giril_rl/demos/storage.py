@@ -39,7 +39,8 @@ def _check_room(folder: Path, transitions: TensorDict) -> None:
     tensors = list(transitions.values(include_nested=True, leaves_only=True))
     needed = sum(x.numel() * x.element_size() + _PAGE for x in tensors)
     place = next(parent for parent in folder.absolute().parents if parent.exists())
-    if shutil.disk_usage(place).free < needed:
+    room = shutil.disk_usage(place)
+    if room.total and room.free < needed:  # Some file systems do not say: 0 of 0.
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(folder))
 
 

@@ -70,6 +70,14 @@ def test_nothing_is_begun_where_there_is_no_room(demo, tmp_path, monkeypatch):
     assert not os.listdir(tmp_path)
 
 
+def test_a_disk_that_does_not_tell_its_size_is_tried(demo, tmp_path, monkeypatch):
+    room = shutil.disk_usage(tmp_path)
+    untold = room._replace(total=0, used=0, free=0)
+    monkeypatch.setattr(shutil, "disk_usage", lambda place: untold)
+    demo.save(tmp_path / "demo")
+    assert len(Demonstration.load(tmp_path / "demo")) == len(demo)
+
+
 def test_unsound_demonstration_is_not_saved(demo, tmp_path):
     demo.transitions["action"][3] = torch.nan
     with pytest.raises(UserError, match="NaN"):
