@@ -64,8 +64,9 @@ def pickled(name):
 
 def linked(name):
     def change(folder):
-        (folder / name).unlink()
-        (folder / name).symlink_to(Path("..", "beside.txt").resolve())
+        elsewhere = Path("..", "elsewhere").resolve()
+        (folder / name).replace(elsewhere)
+        (folder / name).symlink_to(elsewhere)
 
     return change
 
@@ -130,7 +131,7 @@ CASES = {
     ),
     "memmap: a link": (
         lambda: spoilt_demonstration(linked("transitions/action.memmap")),
-        "has ",
+        "has the link 'action.memmap' in it",
     ),
     "memmap: sparse": (lambda: spoilt_demonstration(sparse), "more than this machine's memory"),
     "archive: a path": (lambda: frames(**{"..__..__beside.txt": b"overwritten"}), "holds ../../be"),
