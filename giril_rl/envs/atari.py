@@ -213,7 +213,8 @@ class AtariEnv(BatchedEnv):
             state: what :meth:`simulator_state` returned for an equal environment.
 
         Raises:
-            UserError: if the replay ends elsewhere, which means that ale-py is another version.
+            UserError: if the replay ends elsewhere, which means that ale-py, or the giril_rl that
+                saved the state, is another version.
         """
         self._root_seed = int(state["seed"])
         self._episode = state["episode"].numpy().copy()

@@ -16,9 +16,10 @@ class BatchedEnv(EnvBase):
     """``num_envs`` simulators stepped as one TorchRL environment that can be brought back.
 
     ``("next", "observation")`` at an episode's end is the true terminal observation; the reset
-    observation appears only as the next step's ``"observation"``. Every episode has a seed of its
-    own, drawn from ``seed``, the simulator's index and the episode's number, so that any moment of
-    a run can be rebuilt by replaying actions (:meth:`simulator_state`, :meth:`restore_simulator`).
+    observation appears only as the next step's ``"observation"``. Every episode (of games, every
+    64th) has a seed of its own, drawn from ``seed``, the simulator's index and the episode's
+    number, so that any moment of a run can be rebuilt by replaying actions
+    (:meth:`simulator_state`, :meth:`restore_simulator`).
 
     A subclass makes its simulators, calls :meth:`_declare` with its observation and action specs,
     and defines ``_step``, ``_reset_where`` and the two methods that save and restore.
