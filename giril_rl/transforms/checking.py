@@ -12,6 +12,8 @@ from torch import Tensor
 from giril_rl.errors import UserError
 from giril_rl.transforms.intrinsic import IntrinsicReward
 
+CHECKED = "checked_reward"
+
 
 def check_reward(
     module: TensorDictModuleBase, batch: TensorDictBase, *, deterministic: bool = True
@@ -45,7 +47,8 @@ def check_reward(
         Traceback (most recent call last):
         giril_rl.errors.UserError: a transition's reward depends on the others in the batch: ...
     """
-    relabel = IntrinsicReward(module, extrinsic_key=None)
+    # Not in the place of the environment's reward, which the module may read.
+    relabel = IntrinsicReward(module, reward_key=CHECKED, extrinsic_key=None)
     flat = batch.select(*module.in_keys).reshape(-1)
     if len(flat) < 3:
         raise UserError(f"the batch has {len(flat)} transitions: give at least 3.")
@@ -54,11 +57,11 @@ def check_reward(
 
     def rewards(data: TensorDictBase) -> Tensor:
         """Of a copy of the data; noise goes on from where the module's generator stands."""
-        return relabel(data.clone()).get(("next", "reward"))
+        return relabel(data.clone()).get(("next", CHECKED))
 
     before, given = copy.deepcopy(module.state_dict()), flat.clone()
     random = torch.get_rng_state()
-    whole = relabel(flat).get(("next", "reward"))
+    whole = relabel(flat).get(("next", CHECKED))
     if whole.shape != (len(flat), 1) or not whole.is_floating_point():
         raise UserError(
             f"the reward of {len(flat)} transitions is {whole.dtype} of shape "

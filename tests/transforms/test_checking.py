@@ -91,6 +91,14 @@ def test_a_wrong_reward_is_refused(name, batch):
         check_reward(of(function), batch)
 
 
+def test_a_reward_that_reads_the_environments_is_held_to_the_same(batch):
+    batch["next", "reward"] = torch.arange(20.0).reshape(4, 5, 1)
+    keys = [("next", "reward")], [("next", "intrinsic_reward")]
+    check_reward(TensorDictModule(lambda r: 2 * r, *keys), batch)
+    with pytest.raises(UserError, match="int64"):
+        check_reward(TensorDictModule(lambda r: r.long(), *keys), batch)
+
+
 def test_too_few_transitions_are_refused(batch):
     with pytest.raises(UserError, match="at least 3"):
         check_reward(ConstantReward(1.0), batch[0, :2])
