@@ -13,6 +13,7 @@ import sys
 import traceback
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from giril_rl import recipes
 from giril_rl.cli_parser import Parser as _Parser
@@ -88,7 +89,8 @@ def _run(argv: Sequence[str]) -> int:
                 f"two jobs would share the folder {out}: leave out= to giril, or vary it."
             )
         check_place(out, "out=")
-        check_place(Path(config.root), "root=")
+        if _makes_things_below_root(config):
+            check_place(Path(config.root), "root=")
         jobs[out] = job
     module = recipe.load()
 
@@ -107,6 +109,12 @@ def _run(argv: Sequence[str]) -> int:
     for out in jobs:
         run(out)
     return 0
+
+
+def _makes_things_below_root(config: Any) -> bool:
+    """The run itself, or an expert and a demonstration that were not given."""
+    demo = getattr(config, "demo", None)
+    return config.out is None or (demo is not None and demo.path is None)
 
 
 def _run_all(run: Callable[[Path], None], titles: Mapping[Path, str]) -> int:

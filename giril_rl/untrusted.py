@@ -16,7 +16,7 @@ MOST_BYTES = 16 * 2**20
 """Of a file of settings, results or metadata."""
 _MOST_NODES = 100_000
 _DEEPEST = 50
-_PLAIN_REFERENCE = re.compile(r"\$\{[\w.]+\}")
+_PLAIN_REFERENCE = re.compile(r"\$\{[\w.\[\]]+\}")
 
 
 def read_text(path: Path) -> str:

@@ -30,7 +30,9 @@ def restoring(run: Run, phase: str) -> Iterator[None]:
     except torch.OutOfMemoryError:
         raise  # A RuntimeError, and no reason to delete a checkpoint.
     except (KeyError, IndexError, AttributeError, TypeError, ValueError, RuntimeError) as error:
+        reason = str(error).strip().partition("\n")[0]
         raise UserError(
-            f"{run.folder / phase}.safetensors is a checkpoint of another run or task: delete the "
-            "file to start that part again, or restore a copy."
+            f"{run.folder / phase}.safetensors cannot be put back ({type(error).__name__}: "
+            f"{reason}): if it is a checkpoint of another run or task, delete the file to start "
+            "that part again, or restore a copy."
         ) from error

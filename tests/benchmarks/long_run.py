@@ -62,8 +62,10 @@ def main() -> int:
             with open(args.out, "w", newline="") as file:
                 table = csv.DictWriter(file, COLUMNS)
                 table.writeheader()
-                while time.monotonic() - began < 60 * args.minutes and process.poll() is None:
+                while time.monotonic() - began < 60 * args.minutes:
                     time.sleep(args.every)
+                    if process.poll() is not None:
+                        break
                     rows.append(look(process.pid, Path(temporary), began))
                     table.writerow(rows[-1])
                     file.flush()
@@ -73,6 +75,9 @@ def main() -> int:
             process.kill()
             process.wait()
     late = rows[len(rows) // 2 :]
+    if len(late) < 2:
+        print(f"the run ended at once, exit code {process.returncode}")
+        return 1
     print(f"{rows[-1]['seconds']:,.0f} s, exit code {process.returncode}, table in {args.out}")
     for name in COLUMNS[1:]:
         figures = [row[name] for row in late]

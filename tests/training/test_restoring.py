@@ -12,7 +12,7 @@ from giril_rl.training.restoring import restoring
 @pytest.mark.parametrize("error", [KeyError("step"), RuntimeError("size mismatch")])
 def test_what_does_not_fit_is_of_another_run(error, tmp_path):
     with (
-        pytest.raises(UserError, match=r"ppo\.safetensors is a checkpoint of another run or task"),
+        pytest.raises(UserError, match=r"ppo\.safetensors cannot be put back \(\w+: .*\): if it"),
         restoring(SimpleNamespace(folder=tmp_path), "ppo"),
     ):
         raise error

@@ -266,7 +266,10 @@ PLACES = {
         "is not a run's folder and is not empty (it holds thesis)",
     ),
     "out: shared by two jobs": (giril("-m", "seed=0,1", "out=o"), "two jobs would share the"),
-    "root: a file": (lambda: words(f"root={written('file', '')}"), "choose another root=."),
+    "root: a file": (
+        lambda: words(f"root={written('file', '')}", "demo.path=null"),
+        "choose another root=.",
+    ),
     "run: of other settings": (
         lambda: resumed(lambda folder: None) and words("ppo.lr=0.1"),
         "was made with other settings (ppo.lr: 0.0003 there, 0.1 now)",
@@ -289,11 +292,11 @@ PLACES = {
     "checkpoint: of no version": (lambda: resumed(saved_as("x")), "reads only 1: finish with"),
     "checkpoint: of another part": (
         lambda: resumed(checkpoint(lambda state: {"step": 1})),
-        "is a checkpoint of another run or task",
+        "if it is a checkpoint of another run or task",
     ),
     "checkpoint: of other sizes": (
         lambda: resumed(checkpoint(without_weights)),
-        "is a checkpoint of another run or task",
+        "if it is a checkpoint of another run or task",
     ),
     "expert: nowhere": (
         lambda: words("demo.path=null", "expert.path=nowhere"),
@@ -470,6 +473,12 @@ def test_a_folder_that_cannot_be_made_is_refused(key, here, capsys):
     assert main(texts) == 2
     assert "cannot be written" in capsys.readouterr().err
     assert tree(here) == before
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="needs a folder that nobody can write to")
+def test_a_root_that_nothing_goes_to_is_not_looked_at(here):
+    kept("demonstration")
+    assert main(words("root=/proc/none")) == 0
 
 
 def test_there_are_enough_cases_and_each_is_its_own():
