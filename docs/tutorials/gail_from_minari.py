@@ -5,6 +5,7 @@ not there, one is made of what a heuristic for Pendulum-v1 does. The task has no
 reward pays for staying alive. Lines marked with ``# GAIL`` are this
 package's, all others are plain TorchRL.
 
+    pip install -e ".[minari]"
     python docs/tutorials/gail_from_minari.py --dataset pendulum/heuristic-v0 --frames 300000
 """
 
