@@ -29,9 +29,13 @@ from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
 from giril_rl import IntrinsicReward, ReturnScaling  # GAIL
-from giril_rl.demos import Demonstration, record_demonstration, to_minari  # GAIL
-from giril_rl.demos.importing import import_demonstration  # GAIL
-from giril_rl.demos.task import named_task  # GAIL
+from giril_rl.demos import (  # GAIL
+    Demonstration,
+    import_demonstration,
+    named_task,
+    record_demonstration,
+    to_minari,
+)
 from giril_rl.rewards import DiscriminatorLoss, DiscriminatorReward  # GAIL
 
 DATASET = "pendulum/heuristic-v0"

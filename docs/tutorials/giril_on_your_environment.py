@@ -30,8 +30,7 @@ from torchrl.envs import Compose
 
 from giril_rl import IntrinsicReward, ReturnScaling
 from giril_rl.configs import PPOConfig, TaskConfig
-from giril_rl.demos import Demonstration, subsample
-from giril_rl.demos.importing import import_demonstration
+from giril_rl.demos import Demonstration, import_demonstration, subsample
 from giril_rl.envs import make_env
 from giril_rl.rewards import ConstantReward, GenerativeReward, GenerativeRewardLoss, fit
 from giril_rl.training import RandomPolicy, Run, Scores, evaluate, make_agent, train_ppo

@@ -2,16 +2,20 @@
 
 from giril_rl.demos.check import check_demonstration
 from giril_rl.demos.demonstration import Demonstration
+from giril_rl.demos.importing import import_demonstration
 from giril_rl.demos.minari import to_minari
 from giril_rl.demos.npz import to_npz
 from giril_rl.demos.record import record_demonstration
 from giril_rl.demos.replay import verify_by_replay
 from giril_rl.demos.subsample import holdout, subsample
+from giril_rl.demos.task import named_task
 
 __all__ = [
     "Demonstration",
     "check_demonstration",
     "holdout",
+    "import_demonstration",
+    "named_task",
     "record_demonstration",
     "subsample",
     "to_minari",
