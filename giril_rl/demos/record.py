@@ -18,6 +18,7 @@ from giril_rl.envs.stdout import silent_stdout
 from giril_rl.errors import UserError
 from giril_rl.files import installed_versions
 from giril_rl.progress import progress
+from giril_rl.randomness import seeded
 
 _LONGEST_EPISODE = 1_000_000
 
@@ -94,11 +95,10 @@ def record_demonstration(
     total, unit = (length, "steps") if length is not None else (episodes, "episodes")
     try:
         with (
-            torch.random.fork_rng(devices=[]),
+            seeded(episode_seed(seed, 0)),
             torch.no_grad(),
             progress(total or 0, desc="demonstration", unit=unit) as bar,
         ):
-            torch.default_generator.manual_seed(episode_seed(seed, 0))
             while len(rows) < length if length is not None else len(seeds) < (episodes or 0):
                 seeds.append(episode_seed(seed, len(seeds)))
                 most = _LONGEST_EPISODE if length is None else length - len(rows)

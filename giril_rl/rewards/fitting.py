@@ -6,6 +6,7 @@ import torch
 from tensordict import TensorDictBase
 
 from giril_rl.errors import UserError
+from giril_rl.randomness import seeded
 from giril_rl.rewards.transition_loss import TransitionLoss
 
 
@@ -61,8 +62,7 @@ def fit(
     loss.reward.scaler.fit(data.get(loss.in_keys[0]))
     optimizer = torch.optim.Adam(loss.parameters(), lr=lr)
     loss.train()
-    with torch.random.fork_rng(), torch.enable_grad():
-        torch.manual_seed(seed)
+    with seeded(seed, data.get(loss.in_keys[0]).device), torch.enable_grad():
         for _ in range(steps):
             terms = loss(data[torch.randint(len(data), (batch,))])
             optimizer.zero_grad()
