@@ -92,8 +92,11 @@ def read_runs(folder: Path) -> tuple[list[RunRecord], list[Unfinished]]:
         if not all(type(config[key]) is int for key in ("seed", "steps")):
             others[name] = Unfinished(name, "unfinished", "", "its config.yaml is not a run's")
             continue
-        check_run_format(path.parent)
-        result = read_result(path.parent) if path.with_name("result.json").exists() else None
+        result = None
+        if path.with_name("result.json").exists():
+            result = read_result(path.parent)
+        else:
+            check_run_format(path.parent)
         record = RunRecord(path.parent, name, config, result)
         if record.result is not None:
             finished.append(record)
