@@ -12,7 +12,7 @@ from giril_rl.errors import UserError
 from giril_rl.formats import check_run_format
 from giril_rl.schema import flat
 from giril_rl.training.finished import read_result
-from giril_rl.training.metrics import read_metrics
+from giril_rl.training.metrics import METRICS, read_metrics
 from giril_rl.untrusted import parse_json, parse_yaml, read_text
 
 
@@ -49,7 +49,7 @@ class RunRecord:
 
     def metrics(self) -> list[dict[str, Any]]:
         """The rows of its ``metrics.jsonl``."""
-        return read_metrics(self.folder / "metrics.jsonl")
+        return read_metrics(self.folder / METRICS)
 
 
 @dataclass(frozen=True)

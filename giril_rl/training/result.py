@@ -16,7 +16,7 @@ from giril_rl.report.curve import write_curve
 from giril_rl.report.losses import loss_points, write_losses
 from giril_rl.training.agent import POLICY
 from giril_rl.training.evaluate import evaluate_both
-from giril_rl.training.metrics import read_metrics
+from giril_rl.training.metrics import METRICS, read_metrics
 from giril_rl.training.ppo import Trained
 from giril_rl.training.random_policy import RandomPolicy
 from giril_rl.training.run import Run
@@ -97,7 +97,7 @@ def finish_run(
         agent.save_pretrained(run.folder / POLICY, card)
     if isinstance(reward, Pretrained):
         reward.save_pretrained(run.folder / REWARD, card)
-    rows = read_metrics(run.folder / "metrics.jsonl")
+    rows = read_metrics(run.folder / METRICS)
     names: dict[str, Any] = {"recipe": method, "task": cfg.task.name, "seed": cfg.seed}
     if loss_points(rows):
         write_losses(run.folder, rows, final_return=result["return_mean"], **names)

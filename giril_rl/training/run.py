@@ -19,7 +19,7 @@ from giril_rl.naming import NO_EFFECT, without_added
 from giril_rl.places import cannot_write, check_place
 from giril_rl.schema import flat
 from giril_rl.training.checkpoint import load_state, save_state
-from giril_rl.training.metrics import MetricsFile, check_logger, make_logger
+from giril_rl.training.metrics import METRICS, MetricsFile, check_logger, make_logger
 from giril_rl.untrusted import parse_yaml, read_text
 
 
@@ -111,7 +111,7 @@ class Run:
             run._write_or_compare_config(ignore)
             run._check_checkpoints()
             run._write_versions()
-            run._metrics = MetricsFile(run.folder / "metrics.jsonl")
+            run._metrics = MetricsFile(run.folder / METRICS)
         except BaseException:
             run.close()
             raise
