@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from giril_rl.report.bars import comparable
-from giril_rl.report.formats import with_interval
+from giril_rl.report.formats import budget_text, with_interval
 from giril_rl.report.rows import Panel, Row
 from giril_rl.report.statistics import mean_and_iqm
 
@@ -40,10 +40,13 @@ def overall(panels: Sequence[Panel]) -> str:
         )
     if not lines:
         return ""
-    tasks = "; ".join(f"{panel.title} (demonstration {score:,.1f})" for panel, score, _ in found)
+    tasks = "; ".join(
+        f"{panel.title} (demonstration {score:,.1f}, {budget_text(rows)})"
+        for panel, score, rows in found
+    )
     text = (
         f"Scores divided by the demonstration's, over {len(found)} tasks: {tasks}. `n` is the "
-        "number of seeds on each task. Budgets are those of the tables below.\n"
+        "number of seeds on each task.\n"
     )
     if missing:
         text += f"Not on every task, and so not here: {', '.join(missing)}.\n"

@@ -172,11 +172,14 @@ class Panel:
         """The control with the highest mean at a row's budget, with its recipe's own settings.
 
         A row that took no environment steps is compared with the controls of the largest budget.
+        None where no control was trained at that budget: to be better than a random policy says
+        nothing.
         """
         controls = [other for other in self.main if other.is_control]
         most = max((other.steps for other in controls), default=0)
         steps = row.steps if row.is_trained else most
-        fair = [other for other in controls if other.steps == steps or not other.is_trained]
+        fair = [other for other in controls if other.steps == steps and other.is_trained]
+        fair += [other for other in controls if fair and not other.is_trained]
         return max(fair, key=lambda other: other.estimates[0].value, default=None)
 
 

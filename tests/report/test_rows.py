@@ -212,3 +212,11 @@ def test_the_best_control_has_the_highest_mean_at_that_budget(made):
     estimate, best = lines["BC", 0].improvement
     assert (best.name, estimate.value) == ("control: noise", 0.0)
     assert lines["control: constant", 300_000].improvement is None
+
+
+def test_a_random_policy_alone_is_no_control_to_beat(made):
+    made("control", "reward=random", score=1.0)
+    made("giril", score=2.0)
+    made("bc", score=3.0)
+    (panel,) = panels(made)
+    assert all(line.improvement is None for line in tables_of(panel)[0].lines)

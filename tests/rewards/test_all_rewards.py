@@ -1,6 +1,7 @@
 """Every reward module against the shared checks; a new one is a ``register`` line below."""
 
 import itertools
+from typing import get_args
 
 import pytest
 import reward_checks as checks
@@ -19,6 +20,7 @@ from giril_rl.rewards import (
     NoiseReward,
     ObservationScaler,
     PixelScaler,
+    RewardForm,
 )
 
 RULES = ("demo_range", "standardise", "raw")
@@ -62,12 +64,13 @@ for rule, prior, beta in itertools.product(RULES, ("standard", "conditional"), (
 for rule in RULES:
     register(f"icm-{rule}", curiosity(normalise=rule, clamp=rule != "raw", hidden=[16, 16]))
 register("icm-no-features", curiosity(hidden=[]))
-for rule, form in itertools.product(("running", *RULES), ("positive", "negative", "log_ratio")):
+FORMS = get_args(RewardForm)
+for rule, form in itertools.product(("running", *RULES), FORMS):
     build = adversarial(DiscriminatorReward, normalise=rule, form=form)
     register(f"gail-{rule}-{form}", build, depends_on=("observation", "action"))
-for rule in ("running", "standardise"):
-    build = adversarial(BottleneckReward, normalise=rule, latent=4)
-    register(f"vail-{rule}", build, depends_on=("observation", "action"))
+for rule, form in itertools.product(("running", "standardise"), FORMS):
+    build = adversarial(BottleneckReward, normalise=rule, form=form, latent=4)
+    register(f"vail-{rule}-{form}", build, depends_on=("observation", "action"))
 register("copy", copied, depends_on=("observation", "next_observation"))
 register(
     "constant", lambda c: ConstantReward(2.0, out_keys=c.out_keys), depends_on=(), learned=False
