@@ -12,6 +12,7 @@ from torch import Tensor
 from torchrl.objectives import LossModule
 
 from giril_rl.errors import UserError
+from giril_rl.networks.batch_norm import running_statistics
 from giril_rl.rewards.adversarial import discriminator_loss, gradient_penalty, interpolated
 from giril_rl.rewards.discriminator import DiscriminatorReward
 from giril_rl.rewards.functional import hold_reward, reward_parameters
@@ -131,7 +132,9 @@ class DiscriminatorLoss(LossModule):
         if self.penalty:
             weight = torch.rand(max(len(expert[0]), len(policy[0])), device=logit.device)
             points = [interpolated(e, p, weight) for e, p in zip(expert, policy, strict=True)]
-            out["loss_penalty"] = self.penalty * gradient_penalty(self.reward.logit, points)
+            # By a batch's own statistics each sample's slope would be all samples' together.
+            with running_statistics(self.reward):
+                out["loss_penalty"] = self.penalty * gradient_penalty(self.reward.logit, points)
         out["accuracy_expert"] = (logits[0] > 0).to(logit.dtype).mean()
         out["accuracy_policy"] = (logits[1] < 0).to(logit.dtype).mean()
         return TensorDict({str(key): out[str(key)] for key in self.out_keys})

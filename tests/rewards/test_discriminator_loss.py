@@ -8,7 +8,12 @@ from torchrl.data import Bounded, Categorical, OneHot
 from torchrl.objectives import GAILLoss
 
 from giril_rl.errors import UserError
-from giril_rl.rewards import DiscriminatorLoss, DiscriminatorReward
+from giril_rl.rewards import (
+    BottleneckLoss,
+    BottleneckReward,
+    DiscriminatorLoss,
+    DiscriminatorReward,
+)
 from giril_rl.rewards.adversarial import gradient_penalty
 from giril_rl.training.traced import TracedGradients
 
@@ -258,3 +263,44 @@ def test_bad_penalty():
     for penalty in (-1.0, float("nan")):
         with pytest.raises(UserError, match="penalty"):
             make(penalty=penalty)
+
+
+@pytest.mark.parametrize(
+    ("made", "loss_of"),
+    [(DiscriminatorReward, DiscriminatorLoss), (BottleneckReward, BottleneckLoss)],
+)
+def test_penalty_of_pixels_is_of_single_samples(made, loss_of):
+    reward, plain = (made.for_pixels(SPECS["discrete"], seed=1) for _ in range(2))
+    sets = TensorDict(
+        {
+            name: {
+                "observation": torch.randint(256, (size, 4, 84, 84), dtype=torch.uint8),
+                "action": torch.randint(4, (size,)),
+            }
+            for name, size in (("expert", 2), ("policy", 3))
+        }
+    )
+    torch.manual_seed(3)
+    out = loss_of(reward, penalty=2.0)(sets)
+    # The sets' own pass moves the running statistics, the penalty's does not.
+    loss_of(plain)(sets)
+    for (name, found), expected in zip(reward.named_buffers(), plain.buffers(), strict=True):
+        assert torch.equal(found, expected), name
+    assert all(part.training for part in reward.modules())
+
+    reward.eval()
+    (s, a), (t, b) = (reward.inputs(*sets[name].values()) for name in ("expert", "policy"))
+    torch.manual_seed(3)
+    if made is BottleneckReward:
+        torch.randn(5, reward.encode(s, a)[0].shape[-1])  # z is drawn first.
+    weight = torch.rand(3)
+    norms = []
+    for i in range(3):
+        point = [weight[i] * x[i % 2] + (1 - weight[i]) * y[i] for x, y in ((s, t), (a, b))]
+        point = [x.unsqueeze(0).requires_grad_() for x in point]
+        slopes = torch.autograd.grad(reward.logit(*point).sum(), point)
+        norms.append(torch.cat([slope.flatten() for slope in slopes]).norm().item())
+    expected = 2.0 * sum((norm - 1) ** 2 for norm in norms) / 3
+    assert out["loss_penalty"].item() == pytest.approx(expected, rel=1e-4)
+    total(out).backward()
+    assert all(p.grad.isfinite().all() for p in reward.parameters())
