@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -21,6 +21,14 @@ RESEED_EVERY = 64
 """Games that one seed is for: seeding takes ten times as long as the rest of a reset."""
 
 
+class Opened(NamedTuple):
+    """What the steps that begin lives did, for each game."""
+
+    scored: np.ndarray
+    over: np.ndarray
+    cut: np.ndarray
+
+
 class AtariEnv(BatchedEnv):
     """``num_envs`` games of DeepMind's preprocessing, see :class:`AtariGame`, four frames stacked.
 
@@ -35,7 +43,8 @@ class AtariEnv(BatchedEnv):
     for a game's first opening; to the learner of single lives it is lost.
 
     Observations are uint8 ``(num_envs, 4, 84, 84)``, the latest frame last; actions are integers.
-    ``("next", "game_over")`` tells the end of a game from that of a life.
+    ``("next", "game_over")`` tells the end of a game, ``("next", "life_over")`` that of a life, in
+    either mode.
 
     Each of the ``num_envs`` is seeded anew at every 64th game; games differ in the number of frames
     without action that they begin with.
@@ -83,7 +92,8 @@ class AtariEnv(BatchedEnv):
             Bounded(0, 255, shape=shape, dtype=torch.uint8),
             Categorical(len(self._games[0].meanings), shape=(num_envs,), dtype=torch.int64),
         )
-        self.observation_spec["game_over"] = Categorical(2, shape=(num_envs, 1), dtype=torch.bool)
+        for key in ("game_over", "life_over"):
+            self.observation_spec[key] = Categorical(2, shape=(num_envs, 1), dtype=torch.bool)
 
     @property
     def lives(self) -> np.ndarray:
@@ -108,14 +118,15 @@ class AtariEnv(BatchedEnv):
         cut = np.array([game.cut for game in shown]) & ~over
         lives = np.array([game.lives for game in shown], dtype=np.int64)
         # In some games a lost last life shows before the game is over (Qbert).
-        self._between = (lives < self._lives) & (lives > 0) & ~over & ~cut
+        lost = self._between = (lives < self._lives) & (lives > 0) & ~over & ~cut
         self._lives = lives
         terminated = over | self._between if self._lives_end else over
         if not self._lives_end and self._between.any():
-            scored, ended = self._begin_lives(np.flatnonzero(self._between).tolist())
-            reward += scored
-            over = terminated = over | ended
-            self._between[:] = False
+            opened = self._begin_lives(np.flatnonzero(self._between).tolist())
+            reward += opened.scored
+            over = terminated = over | opened.over
+            cut |= opened.cut
+            self._between = np.zeros_like(lost)
         return TensorDict(
             {
                 "observation": torch.from_numpy(self._last_observation),
@@ -124,6 +135,7 @@ class AtariEnv(BatchedEnv):
                 "terminated": torch.from_numpy(terminated).unsqueeze(-1),
                 "truncated": torch.from_numpy(cut).unsqueeze(-1),
                 "game_over": torch.from_numpy(over | cut).unsqueeze(-1),
+                "life_over": torch.from_numpy(lost | over | cut).unsqueeze(-1),
             },
             batch_size=self.batch_size,
         )
@@ -136,21 +148,23 @@ class AtariEnv(BatchedEnv):
         return [self._games[i].receive() for i in indices]
 
     def _root(self, observation: torch.Tensor) -> TensorDictBase:
-        return super()._root(observation).set("game_over", self._false)
+        root = super()._root(observation)
+        return root.set("game_over", self._false).set("life_over", self._false)
 
     def _reset_where(self, mask: np.ndarray) -> np.ndarray:
-        _, ended = self._begin_lives(np.flatnonzero(mask & self._between).tolist())
-        fresh = mask & ~self._between | ended
+        opened = self._begin_lives(np.flatnonzero(mask & self._between).tolist())
+        fresh = mask & ~self._between | opened.over | opened.cut
         while fresh.any():  # The opening of a game may end it, if hardly ever.
-            fresh = self._begin_games(np.flatnonzero(fresh).tolist())
+            opened = self._begin_games(np.flatnonzero(fresh).tolist())
+            fresh = opened.over | opened.cut
         self._between[mask] = False
         return self._last_observation
 
-    def _begin_games(self, indices: list[int]) -> np.ndarray:
+    def _begin_games(self, indices: list[int]) -> Opened:
         frames = {}
         for i in indices:
             frames[i], self._lives[i] = self._next_game(i)
-        return self._open(indices, self._opening, frames)[1]
+        return self._open(indices, self._opening, frames)
 
     def _next_game(self, i: int) -> tuple[np.ndarray, int]:
         fresh = self._episode[i] % RESEED_EVERY == 0
@@ -159,28 +173,28 @@ class AtariEnv(BatchedEnv):
         self._actions[i] = []
         return shown
 
-    def _begin_lives(self, indices: list[int]) -> tuple[np.ndarray, np.ndarray]:
+    def _begin_lives(self, indices: list[int]) -> Opened:
         return self._open(indices, [NOOP, *self._opening], {})
 
     def _open(
         self, indices: list[int], actions: list[int], frames: dict[int, np.ndarray]
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Plays ``actions`` in some games and clears their stacks; what was scored, which ended."""
+    ) -> Opened:
+        """Plays ``actions`` in some games and clears their stacks."""
         scored = np.zeros(len(self._games), dtype=np.float32)
-        ended = np.zeros(len(self._games), dtype=bool)
+        over, cut = (np.zeros(len(self._games), dtype=bool) for _ in range(2))
         playing = list(indices)
         for action in actions:
             for i, shown in zip(playing, self._play(playing, [action] * len(playing)), strict=True):
                 frames[i], self._lives[i] = shown.frame, shown.lives
                 scored[i] += shown.reward
-                ended[i] = shown.over or shown.cut
-            playing = [i for i in playing if not ended[i]]
+                over[i], cut[i] = shown.over, shown.cut and not shown.over
+            playing = [i for i in playing if not (over[i] or cut[i])]
         # What was handed out before stays as it is: a batch may hold it.
         self._last_observation = self._last_observation.copy()
         self._last_observation[indices] = 0
         for i in indices:
             self._last_observation[i, -1] = frames[i]
-        return scored, ended
+        return Opened(scored, over, cut)
 
     def _set_seed(self, seed: int | None) -> None:
         super()._set_seed(seed)

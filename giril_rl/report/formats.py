@@ -35,6 +35,8 @@ COLUMNS = (
     "each_seed_mode",
     "demonstration",
     "expert",
+    "life_length",
+    "steps_per_second",
 )
 
 
@@ -99,10 +101,12 @@ def budget_text(rows: Iterable[Row]) -> str:
 
 
 def markdown(table: Table) -> str:
-    """The table as Markdown, without its caption."""
+    """The table as Markdown, without its caption; games have life length and speed besides."""
     varied = table.name != "results"
+    lives = any(line.row.life_length is not None for line in table.lines)
     head = ["method", *(["setting"] if varied else []), "n", "steps", "mean [95%]", "IQM [95%]"]
-    head += ["mode", "P(> best control) [95%]", "paper", "each seed"]
+    head += ["mode", "P(> best control) [95%]", "paper"]
+    head += [*(["life length", "steps/s"] if lives else []), "each seed"]
     cells = [head, ["---"] * len(head)]
     for line in table.lines:
         row = line.row
@@ -118,6 +122,7 @@ def markdown(table: Table) -> str:
                 number(row.mode_mean),
                 with_interval(line.improvement[0], 2) if line.improvement else "-",
                 number(line.paper.value if line.paper else None),
+                *([number(row.life_length), number(row.speed)] if lives else []),
                 " ".join(number(score) for score in row.scores),
             ]
         )
@@ -152,4 +157,6 @@ def _cells(table: Table, line: Line) -> list[Any]:
         " ".join(map(str, row.modes)),
         panel.reference("demo"),
         panel.reference("expert"),
+        row.life_length,
+        row.speed,
     ]

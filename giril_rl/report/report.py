@@ -29,7 +29,10 @@ _RUN_COLUMNS = (
     "env_steps",
     "return_mean",
     "mode_return_mean",
+    "episode_length_mean",
+    "life_length_mean",
     "wall_seconds",
+    "steps_per_second",
     "config_hash",
     "last_line",
 )
@@ -88,7 +91,9 @@ def _head(runs: Sequence[RunRecord], unfinished: Sequence[Unfinished]) -> str:
         "with few seeds they are too narrow: read the seeds. IQM is the interquartile mean. "
         "`P(> best control)` is the probability that a run of the method scores above a run of the "
         "control with the highest mean on that task at that budget, a draw counting one half; that "
-        "control was chosen by these same runs. `paper` is the paper's mean.\n"
+        "control was chosen by these same runs. `paper` is the paper's mean. For games, `life "
+        "length` is agent steps for each life and `steps/s` what the policy's training made of the "
+        "machine, shared with whatever ran beside it.\n"
     )
 
 

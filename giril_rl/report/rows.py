@@ -87,6 +87,18 @@ class Row:
         return sorted({int(result["env_steps"]) for result in self.results})
 
     @property
+    def life_length(self) -> float | None:
+        """Mean over runs of the steps that a life lasts; None for tasks without lives."""
+        return _mean([result.get("life_length_mean") for result in self.results])
+
+    @property
+    def speed(self) -> float | None:
+        """Mean over runs of the environment steps a second that training took."""
+        if not self.is_trained:
+            return None
+        return _mean([result.get("steps_per_second") for result in self.results])
+
+    @property
     def is_trained(self) -> bool:
         """Whether it took steps in the environment: cloning and a random policy do not."""
         return any(self.trained_steps)
@@ -102,6 +114,12 @@ class Row:
         # `released` is the default and comes first.
         changes = [(key, _numeric(value)) for key, value in self.changes]
         return (*rank(self.method), self.profile != "released", self.steps, changes)
+
+
+def _mean(values: Sequence[float | None]) -> float | None:
+    """None where a value is missing."""
+    found = [value for value in values if value is not None]
+    return sum(found) / len(found) if found and len(found) == len(values) else None
 
 
 def _numeric(text: str) -> tuple[float, str]:

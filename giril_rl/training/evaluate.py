@@ -26,12 +26,16 @@ class Player(Protocol):
 
 @dataclass
 class Scores:
-    """Undiscounted true returns over whole episodes."""
+    """Undiscounted true returns over whole episodes.
+
+    ``life_length_mean`` is steps divided by lives, None for tasks without lives.
+    """
 
     return_mean: float
     return_std: float
     return_median: float
     episode_length_mean: float
+    life_length_mean: float | None
     episodes: int
     returns: list[float]
 
@@ -80,6 +84,7 @@ def evaluate(
     returns = torch.zeros(episodes, dtype=torch.float64)
     lengths = torch.zeros(episodes, dtype=torch.int64)
     playing = torch.ones(episodes, dtype=torch.bool)
+    lives = 0
     device = getattr(agent, "device", torch.device("cpu"))
     with seeded(seed, device), torch.no_grad(), set_exploration_type(mode):
         tensordict = env.reset()
@@ -88,6 +93,9 @@ def evaluate(
             reward: Tensor = tensordict.get(("next", "reward")).squeeze(-1)
             returns[playing] += reward[playing].double()
             lengths += playing
+            life_over = tensordict.get(("next", "life_over"), None)
+            if life_over is not None:
+                lives += int(life_over.squeeze(-1)[playing].sum())
             playing &= ~tensordict.get(("next", "done")).squeeze(-1)
             tensordict = following
     env.close()
@@ -96,6 +104,7 @@ def evaluate(
         return_std=returns.std().item() if episodes > 1 else 0.0,
         return_median=returns.quantile(0.5).item(),
         episode_length_mean=lengths.double().mean().item(),
+        life_length_mean=lengths.sum().item() / lives if lives else None,
         episodes=episodes,
         returns=returns.tolist(),
     )

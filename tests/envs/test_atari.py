@@ -9,6 +9,7 @@ from torchrl.envs.utils import check_env_specs
 
 from giril_rl.configs import TaskConfig
 from giril_rl.envs import AtariEnv, AtariGymEnv, for_scores, gym_factory, make_env
+from giril_rl.envs.atari import Opened
 from giril_rl.envs.atari_game import AtariGame
 from giril_rl.errors import UserError
 from giril_rl.recipes import shipped_conf
@@ -104,6 +105,7 @@ def test_a_lost_life_ends_an_episode_with_its_own_last_stack_and_not_the_game():
     over = batch["next", "game_over"].squeeze(-1)
     assert done.sum() > over.sum() > 0 and not (over & ~done).any()
     assert torch.equal(done, batch["next", "terminated"].squeeze(-1))
+    assert torch.equal(done, batch["next", "life_over"].squeeze(-1))
     # The end's stack continues that life's: no jump to what comes after.
     assert torch.equal(following[..., :3, :, :], batch["observation"][..., 1:, :, :])
     assert (following[done][:, 2:].flatten(1).float().mean(1) > 0).all()
@@ -169,6 +171,33 @@ def test_whole_game_scores_are_those_of_a_plain_loop(name):
                 plain += shown.reward
         lives = shown.lives
     assert shown.over and plain == score and score > 0
+
+
+def test_lost_lives_show_in_whole_games_too():
+    env = AtariEnv("breakout", 1, episode="game", seed=0)
+    batch = play(env, 500)
+    over, lost = (batch["next", key].squeeze() for key in ("game_over", "life_over"))
+    assert over.sum() >= 2 and not (over & ~lost).any()
+    ends = over.nonzero().squeeze(-1).tolist()
+    assert lost[: ends[0] + 1].sum() == lost[ends[0] + 1 : ends[1] + 1].sum() == 5
+
+
+def test_an_opening_that_reaches_the_frame_cap_cuts_the_game(monkeypatch):
+    """The step after a lost life is the game's last: neither a success of death nor lost."""
+    env = AtariEnv("breakout", 1, episode="game", seed=0)
+    root = env.reset()
+    monkeypatch.setattr(env, "_begin_lives", lambda indices: opened)
+    for cut in (True, False):
+        ended = np.array([True])
+        opened = Opened(np.array([3.0], dtype=np.float32), ended & (not cut), ended & cut)
+        lost = False
+        while not lost:
+            root.set("action", torch.zeros(1, dtype=torch.int64))
+            after, root = env.step_and_maybe_reset(root)
+            lost = after["next", "life_over"].item()
+        found = {key: after["next", key].item() for key in ("done", "terminated", "truncated")}
+        assert found == {"done": True, "terminated": not cut, "truncated": cut}
+        assert after["next", "game_over"].item() and after["next", "reward"].item() == 3.0
 
 
 def test_a_game_is_cut_at_the_frame_cap():

@@ -68,6 +68,7 @@ def test_each_recipe_leaves_a_whole_result(recipe, expert, root, tmp_path):
     for scores in (result, result["deterministic"]):
         assert len(scores["returns"]) == 1 and math.isfinite(scores["return_mean"])
         assert 20 < scores["episode_length_mean"] <= 60
+        assert 5 < scores["life_length_mean"] <= scores["episode_length_mean"]
     (card,) = root.glob("demos/breakout/*/card.json")
     demo = Demonstration.load(card.parent)
     assert result["demo_transitions"] == len(demo) > 10

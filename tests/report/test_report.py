@@ -212,3 +212,20 @@ def test_no_curve_is_cut_off(made, drawn, tmp_path):
         "reward.prior=conditional, 300,000 steps, n = 1",
         "reward.prior=conditional, 2,000,000 steps, n = 1",
     ]
+
+
+def test_games_have_life_length_and_speed(made, capsys):
+    for seed, length in ((0, 50.0), (1, 70.0)):
+        made(
+            "control",
+            "task=breakout",
+            f"seed={seed}",
+            score=2.0,
+            life_length_mean=length,
+            steps_per_second=500.0,
+        )
+    out, _ = report(made, capsys)
+    text = (out / "report.md").read_text()
+    assert "| life length | steps/s |" in text and "| 60.0 | 500.0 |" in text
+    rows = list(csv.DictReader((out / "results.csv").open()))
+    assert [(row["life_length"], row["steps_per_second"]) for row in rows] == [("60.0", "500.0")]

@@ -49,6 +49,7 @@ def test_scores_are_those_of_one_whole_episode_in_each_environment(task):
     assert scores.return_median == pytest.approx(np.median(returns), rel=1e-5)
     assert scores.episode_length_mean == np.mean(lengths)
     assert scores.episodes == len(scores.returns) == 12
+    assert scores.life_length_mean is None
 
 
 def test_a_time_limit_ends_an_episode():
