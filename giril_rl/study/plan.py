@@ -78,17 +78,20 @@ class Planner:
 
         Args:
             spec: the study.
-            changes: ``key=value`` texts that take the place of every group's own.
+            changes: ``key=value`` texts that take the place of every group's own, where its recipe
+                has that knob; ``seed`` and ``steps`` not of a ``player``, nor ``steps`` of cloning.
 
         Raises:
             UserError: in one sentence, naming the group, for an unknown recipe or key, a wrong type
                 or value, or two runs that are the same.
         """
         runs: dict[str, StudyRun] = {}
+        schemas = self._all_schemas(spec)
+        shared = [text for text in changes if not any(_has(s, text) for s in schemas)]
         for group in spec.groups:
             for word in group.recipes:
                 try:
-                    found = self._runs(group, word, changes)
+                    found = self._runs(group, word, changes, shared)
                 except UserError as error:
                     raise UserError(f"{spec.name}, group {group.label!r}: {error}") from None
                 for run in found:
@@ -105,12 +108,29 @@ class Planner:
             _check_finished(run)
         return sorted(runs.values(), key=lambda run: run.config.seed)
 
-    def _runs(self, group: Group, word: str, changes: Sequence[str]) -> list[StudyRun]:
+    def _all_schemas(self, spec: Spec) -> list[type[Any]]:
+        found = []
+        for group in spec.groups:
+            try:
+                found += [self._recipe(word)[1] for word in group.recipes]
+            except UserError as error:
+                raise UserError(f"{spec.name}, group {group.label!r}: {error}") from None
+        return found
+
+    def _runs(
+        self, group: Group, word: str, changes: Sequence[str], shared: Sequence[str]
+    ) -> list[StudyRun]:
         from giril_rl.overrides import sweep
 
         recipe, schema = self._recipe(word)
-        if _clones(schema):  # A budget of environment steps for all other groups says nothing here.
-            changes = [text for text in changes if not text.startswith("steps=")]
+        # What no recipe has is left in, to be refused; so are choices such as the task.
+        changes = [text for text in changes if text in shared or _has(schema, text)]
+        kept: tuple[str, ...] = ()
+        if group.player:  # With another seed or budget it would be nobody's expert.
+            kept = ("seed=", "steps=")
+        elif _clones(schema):  # A budget of environment steps says nothing here.
+            kept = ("steps=",)
+        changes = [text for text in changes if not text.startswith(kept)]
         own = [text.partition("=")[0] for text in changes]
         texts = [
             override_text(key, value, is_list=_holds_list(schema, key))
@@ -192,6 +212,12 @@ def _holds_list(schema: type[Any], key: str) -> bool:
     from giril_rl.schema import leaves
 
     return any(leaf.key == key and "list" in leaf.needed for leaf in leaves(schema))
+
+
+def _has(schema: type[Any], text: str) -> bool:
+    from giril_rl.schema import leaves
+
+    return any(leaf.key == text.partition("=")[0] for leaf in leaves(schema))
 
 
 def _clones(schema: type[Any]) -> bool:

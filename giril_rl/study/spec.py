@@ -24,11 +24,14 @@ class Group:
         label: the group's name.
         recipes: names of recipes or paths of copied ones.
         knobs: ``{dotted key: value}``; see :func:`override_text` for lists.
+        player: whether its runs are the experts that the others record, which the command line's
+            ``seed=`` and ``steps=`` are not for.
     """
 
     label: str
     recipes: tuple[str, ...]
     knobs: dict[str, Any]
+    player: bool = False
 
 
 @dataclass(frozen=True)
@@ -130,11 +133,13 @@ def _group(path: Path, number: int, entry: Any, shared: Mapping[str, Any]) -> Gr
     if not isinstance(entry, dict) or not isinstance(entry.get("label"), str):
         raise UserError(f"{path}: group {number} has no label: give it one, label: TEXT.")
     own = dict(entry)
-    label, recipes = own.pop("label"), own.pop("recipe", None)
+    label, recipes, player = own.pop("label"), own.pop("recipe", None), own.pop("player", False)
+    if not isinstance(player, bool):
+        raise UserError(f"{path}: group {label!r} has player: {player}: write true or false.")
     recipes = recipes if isinstance(recipes, list) else [recipes]
     if not recipes or not all(isinstance(name, str) for name in recipes):
         raise UserError(f"{path}: group {label!r} has no recipe: give one, or a list of them.")
-    return Group(label, tuple(recipes), {**flat(shared), **flat(own)})
+    return Group(label, tuple(recipes), {**flat(shared), **flat(own)}, player)
 
 
 def override_text(key: str, value: Any, *, is_list: bool = False) -> str:

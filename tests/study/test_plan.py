@@ -8,10 +8,11 @@ import pytest
 from giril_rl.cli import main
 from giril_rl.compose import groups
 from giril_rl.errors import UserError
-from giril_rl.naming import config_hash
+from giril_rl.naming import config_hash, out_folder
 from giril_rl.recipes import find
 from giril_rl.study.plan import Planner
-from giril_rl.study.spec import find_study, read_spec
+from giril_rl.study.spec import find_study, read_spec, shipped_studies
+from giril_rl.training.expert import expert_settings
 
 
 def plan(name, *changes):
@@ -155,7 +156,47 @@ def test_a_finished_run_of_other_settings_is_refused(study):
         plan(name)
 
 
-STUDIES = ("smoke", "pybullet", "pybullet-ablations", "pybullet-no-survival")
+def test_a_knob_of_some_recipes_changes_those(study):
+    name = study("groups: [{label: a, recipe: fake.py}, {label: b, recipe: [giril, cdil]}]")
+    first, *others = plan(name, "fit.steps=7")
+    assert first.words == ()
+    assert [run.config.fit.steps for run in others] == [7, 7]
+    with pytest.raises(UserError, match="group 'a'.*fit.stops"):
+        plan(name, "fit.stops=7")
+
+
+def test_the_command_lines_seed_and_budget_leave_the_player_as_the_others_want_it(study):
+    """Else the study would train one expert, and its first imitator another."""
+    name = study(
+        """
+all: {task: [inverted_pendulum, half_cheetah], seed: [0, 1]}
+groups:
+  - {label: player, player: true, recipe: expert, seed: 0}
+  - {label: measure, recipe: expert, stop_early: false}
+  - {label: others, recipe: [giril, bc]}
+"""
+    )
+    for changes in ([], ["seed=5", "steps=400000"]):
+        runs = plan(name, *changes)
+        players = {run.folder for run in runs if run.label == "player"}
+        wanted = {
+            out_folder("expert", expert_settings(run.config, run.config.expert), {})
+            for run in runs
+            if run.label == "others"
+        }
+        assert players == wanted and len(wanted) == 2
+    measured = [run.config for run in runs if run.label == "measure"]
+    assert [(config.seed, config.steps) for config in measured] == [(5, 400_000)] * 2
+
+
+@pytest.mark.parametrize("text", ["player: 1", "player: [true]"])
+def test_a_player_is_one_or_not(study, text):
+    with pytest.raises(UserError, match="group 'a' has player: .*: write true or false"):
+        plan(study(f"groups: [{{label: a, recipe: expert, {text}}}]"))
+
+
+STUDIES = tuple(shipped_studies())
+GAMES = ("atari", "atari-small")
 
 
 def test_every_shipped_study_fits_the_recipes():
@@ -167,7 +208,7 @@ def test_every_shipped_study_fits_the_recipes():
         for group in spec.groups:
             named = group.knobs["task"]
             assert set(named if isinstance(named, list) else [named]) <= set(tasks)
-        assert planner.plan(spec, ["task=inverted_pendulum"])
+        assert planner.plan(spec, [f"task={'breakout' if name in GAMES else 'inverted_pendulum'}"])
 
 
 @pytest.mark.slow
