@@ -196,7 +196,7 @@ def test_a_player_is_one_or_not(study, text):
 
 
 STUDIES = tuple(shipped_studies())
-GAMES = ("atari", "atari-small")
+GAMES = ("atari", "atari-small", "atari-smoke")
 
 
 def test_every_shipped_study_fits_the_recipes():
@@ -216,14 +216,21 @@ def test_shipped_studies_hold_what_they_say():
     planner = Planner(Path("runs"))
     plans = {name: planner.plan(read_spec(find_study(name))) for name in STUDIES}
     counts = {name: len(runs) for name, runs in plans.items()}
-    # 2 experts; on 2 tasks with 5 seeds: 2 methods in 2 profiles, 2 adversarial, BC, 8 controls.
-    assert counts["pybullet"] == 2 + 2 * 5 * (2 * 2 + 2 + 1 + 8)
-    # On 2 tasks with 3 seeds: own settings, 2 betas in 2 profiles, unscaled, I_c, 3 forms, numbers.
-    assert counts["pybullet-ablations"] == 2 * 3 * (4 + 2 + 4 + 4 + 1 + 3 + 4 * 3 + 3)
-    assert counts["pybullet-no-survival"] == 3 + 3 * 3 * (2 * 2 + 2 + 1 + 8)
-    names = {name: {run.name for run in runs} for name, runs in plans.items()}
-    # Own settings are run once for both studies.
-    assert len(names["pybullet"] & names["pybullet-ablations"]) == 2 * 3 * (4 + 2)
+    # 2 experts; on 2 tasks with 5 seeds: 2 methods in 2 profiles, 2 adversarial, BC, 8 controls and
+    # 4 in the profile paper.
+    assert counts["pybullet"] == 2 + 2 * 5 * (2 * 2 + 2 + 1 + 8 + 4)
+    # On 2 tasks with 3 seeds: own settings, 2 betas in 2 profiles, unscaled, I_c, 3 forms, numbers,
+    # BC's, controls.
+    assert counts["pybullet-ablations"] == 2 * 3 * (4 + 2 + 4 + 4 + 1 + 3 + 4 * 3 + 3 + 3 + 2)
+    # 3 experts, the true reward; on 3 tasks with 3 seeds as above, and both forms of 2 methods.
+    assert counts["pybullet-no-survival"] == 3 + 3 * 3 + 3 * 3 * (2 * 2 + 2 * 2 + 1 + 8)
+    assert counts["atari-smoke"] == 6 * (1 + 5 + 5)
+    # 2 experts; on 2 games with 2 seeds: GIRIL in 2 profiles, CDIL, 2 adversarial, BC, 6 controls.
+    assert counts["atari-small"] == 2 + 2 * 2 * (2 + 1 + 2 + 1 + 6)
+    names = {run.name for run in plans["pybullet"]}
+    same = planner.plan(read_spec(find_study("pybullet-ablations")), ["steps=1000000"])
+    # At one budget own settings and controls are run once for both studies.
+    assert len(names & {run.name for run in same}) == 2 * 3 * (4 + 2 + 3 + 2)
 
 
 def test_experts_go_first(study):
