@@ -161,7 +161,7 @@ def test_a_knob_of_some_recipes_changes_those(study):
     first, *others = plan(name, "fit.steps=7")
     assert first.words == ()
     assert [run.config.fit.steps for run in others] == [7, 7]
-    with pytest.raises(UserError, match="group 'a'.*fit.stops"):
+    with pytest.raises(UserError, match=r"group 'a'.*fit\.stops"):
         plan(name, "fit.stops=7")
 
 
@@ -191,7 +191,7 @@ groups:
 
 @pytest.mark.parametrize("text", ["player: 1", "player: [true]"])
 def test_a_player_is_one_or_not(study, text):
-    with pytest.raises(UserError, match="group 'a' has player: .*: write true or false"):
+    with pytest.raises(UserError, match=r"group 'a' has player: .*: write true or false"):
         plan(study(f"groups: [{{label: a, recipe: expert, {text}}}]"))
 
 
