@@ -36,10 +36,10 @@ from giril_rl.training import Run, make_agent, train_ppo
 from giril_rl.transforms import BatchMeanReward, IntrinsicReward, ReturnScaling
 
 
-def ours(config: RunConfig) -> Callable[[int], None]:
+def ours(config: RunConfig, device: str) -> Callable[[int], None]:
     """The whole loop of the recipes, its log and checkpoints included."""
     env = make_env(config.task, config.ppo.num_envs, seed=0)
-    agent = make_agent(env, config.ppo, seed=0)
+    agent = make_agent(env, config.ppo, seed=0).to(device)
     reward = GenerativeReward.for_pixels(env.action_spec).eval()
     env.close()
     relabel = Compose(IntrinsicReward(reward), BatchMeanReward(), ReturnScaling(config.ppo.gamma))
@@ -55,7 +55,7 @@ def ours(config: RunConfig) -> Callable[[int], None]:
     return train
 
 
-def theirs(config: RunConfig) -> Callable[[int], None]:
+def theirs(config: RunConfig, device: str) -> Callable[[int], None]:
     """stable-baselines3's PPO, its CnnPolicy and its Atari wrappers."""
     gymnasium.register_envs(ale_py)
     cfg = config.ppo
@@ -71,7 +71,7 @@ def theirs(config: RunConfig) -> Callable[[int], None]:
         learning_rate=cfg.lr,
         ent_coef=cfg.entropy_coef,
         vf_coef=cfg.value_coef,
-        device="cpu",
+        device=device,
         seed=0,
     )
 
@@ -86,6 +86,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--game", default="Breakout", help="as in ALE/Breakout-v5")
     parser.add_argument("--threads", type=int, default=os.cpu_count())
+    parser.add_argument("--device", default="cpu", help="of both, such as cuda")
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--batches", type=int, default=6, help="batches of 1,024 steps a round")
     args = parser.parse_args()
@@ -94,7 +95,10 @@ def main() -> None:
     task = TaskConfig(name=args.game, env_id=f"ALE/{args.game}-v5")
     config = apply_task_defaults(RunConfig(task=task))
     steps = args.batches * config.ppo.num_envs * config.ppo.rollout
-    pair = {"giril_rl": ours(config), "stable-baselines3": theirs(config)}
+    pair = {
+        "giril_rl": ours(config, args.device),
+        "stable-baselines3": theirs(config, args.device),
+    }
     ratios = []
     for number in range(args.rounds + 1):
         speed = {}
@@ -108,7 +112,8 @@ def main() -> None:
         shown = ", ".join(f"{name} {value:,.0f} steps/s" for name, value in speed.items())
         print(f"round {number}: {shown}, ratio {ratios[-1]:.2f}", flush=True)
     print(
-        f"{args.game}, {args.threads} threads: ratio {statistics.median(ratios):.2f} "
+        f"{args.game}, {args.device}, {args.threads} threads: "
+        f"ratio {statistics.median(ratios):.2f} "
         f"(median of {len(ratios)}, {min(ratios):.2f} to {max(ratios):.2f})"
     )
 
