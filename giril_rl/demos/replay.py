@@ -59,7 +59,7 @@ def verify_by_replay(
             bits, which a deterministic simulator gives on the same machine.
 
     Raises:
-        UserError: at the first transition that differs.
+        UserError: at the first transition that differs, or whose action there is none of.
 
     Examples:
         >>> from giril_rl.demos import Demonstration, record_demonstration
@@ -97,12 +97,23 @@ def verify_by_replay(
             )
             for _ in range(length):
                 action = as_executed(data["action"][index], env.action_space)
+                _check_action(action, env.action_space, index)
                 outcome = env.step(action)[:4]
                 for name, value in zip(names, outcome, strict=True):
                     _compare(name, index, after[name][index], as_recorded(value), tolerance)
                 index += 1
         finally:
             env.close()
+
+
+def _check_action(action: np.ndarray | int, space: gymnasium.Space, index: int) -> None:
+    """A real action may leave its bounds, which are clamped; an integer that is no action not."""
+    if isinstance(space, gymnasium.spaces.Discrete) and not space.contains(action):
+        raise UserError(
+            f"the demonstration has the action {action} at index {index}, and the environment has "
+            f"none but {int(space.start)} to {int(space.start + space.n) - 1}: it is of another "
+            "environment."
+        )
 
 
 def _compare(

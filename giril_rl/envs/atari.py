@@ -10,8 +10,15 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Bounded, Categorical
 
-from giril_rl.envs.atari_game import FRAME_CAP, NOOP, SIDE, AtariGame, Shown
+from giril_rl.envs.atari_game import FRAME_CAP, NOOP, SIDE, SKIP, AtariGame, Shown
 from giril_rl.envs.batched import NOT_REPEATING, BatchedEnv
+from giril_rl.envs.saved import (
+    check_counts,
+    check_game_actions,
+    saved_array,
+    saved_seed,
+    saved_tensor,
+)
 from giril_rl.errors import UserError
 
 Episode = Literal["life", "game"]
@@ -81,6 +88,7 @@ class AtariEnv(BatchedEnv):
             raise UserError(f"task.episode={episode}: choose one of life, game.")
         super().__init__(num_envs, seed=seed)
         self._games = [AtariGame(game, frame_cap) for _ in range(num_envs)]
+        self._longest = -(-frame_cap // SKIP)
         self._lives_end = episode == "life"
         self._opening = [1, 2] if self._games[0].fires else []
         self._lives = np.zeros(num_envs, dtype=np.int64)
@@ -227,15 +235,20 @@ class AtariEnv(BatchedEnv):
             state: what :meth:`simulator_state` returned for an equal environment.
 
         Raises:
+            ValueError: if it is no state of such an environment; nothing is played then.
             UserError: if the replay ends elsewhere, which means that ale-py, or the giril_rl that
                 saved the state, is another version.
         """
-        self._root_seed = int(state["seed"])
-        self._episode = state["episode"].numpy().copy()
-        self._between = state["between"].numpy().copy()
-        self._lives = state["lives"].numpy().copy()
-        self._last_observation = state["observation"].numpy().copy()
-        actions = state["actions"].numpy()
+        seed = saved_seed(state)
+        episode = saved_array(state, "episode", self._episode)
+        between = saved_array(state, "between", self._between)
+        saved_lives = saved_array(state, "lives", self._lives)
+        observation = saved_array(state, "observation", self._last_observation)
+        actions = saved_tensor(state, "actions")
+        check_counts("episode", episode, 1)
+        check_game_actions(actions, len(self._games), len(self.meanings), self._longest)
+        self._root_seed, self._episode, self._between = seed, episode, between
+        self._lives, self._last_observation = saved_lives, observation
         frames, lives = np.zeros_like(self._last_observation[:, -1]), np.zeros_like(self._lives)
         for i, begun in enumerate(self._episode.tolist()):
             self._episode[i] = (begun - 1) // RESEED_EVERY * RESEED_EVERY

@@ -11,6 +11,8 @@ from giril_rl.nearest import did_you_mean
 
 SIDE = 84
 NOOP = 0
+SKIP = 4
+"""Frames for which an action is repeated."""
 FRAME_CAP = 108_000
 """Emulated frames after which a game is cut: half an hour of play, as in DeepMind's evaluation."""
 
@@ -65,6 +67,7 @@ class AtariGame:
             rom_path=path,
             num_envs=1,
             stack_num=1,
+            frame_skip=SKIP,
             use_fire_reset=False,
             reward_clipping=False,
             max_episode_steps=frame_cap,
@@ -90,7 +93,13 @@ class AtariGame:
         return shown[0, 0], int(info["lives"][0])
 
     def send(self, action: int) -> None:
-        """Lets the game play ``action`` for four frames."""
+        """Lets the game play ``action`` for four frames.
+
+        Raises:
+            ValueError: if the game has no such action; ale-py would never show anything again.
+        """
+        if not 0 <= action < len(self.meanings):
+            raise ValueError(f"the game has no action {action}, only 0 to {len(self.meanings) - 1}")
         self._ale.send([action], [1.0])
 
     def receive(self) -> Shown:

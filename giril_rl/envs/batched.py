@@ -118,6 +118,9 @@ class BatchedEnv(EnvBase):
 
         Args:
             state: what :meth:`simulator_state` returned for an equal environment.
+
+        Raises:
+            ValueError: if it is no state of such an environment; nothing is played then.
         """
 
 

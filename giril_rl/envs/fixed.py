@@ -11,6 +11,7 @@ import torch
 from tensordict import TensorDictBase
 from torchrl.data import Categorical
 
+from giril_rl.envs.saved import saved_array
 from giril_rl.envs.vector import GymVectorEnv
 from giril_rl.errors import UserError
 
@@ -131,5 +132,5 @@ class FixedHorizonEnv(GymVectorEnv):
         }
 
     def _restore_clocks(self, state: dict[str, Any]) -> None:
-        self._played = state["played"].numpy().copy()
-        self._failed = state["failed"].numpy().copy()
+        self._played = saved_array(state, "played", self._played)
+        self._failed = saved_array(state, "failed", self._failed)

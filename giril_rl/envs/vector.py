@@ -13,6 +13,7 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Bounded, Unbounded
 
 from giril_rl.envs.batched import NOT_REPEATING, BatchedEnv
+from giril_rl.envs.saved import check_actions, check_counts, saved_array, saved_seed, saved_tensor
 from giril_rl.envs.spaces import action_spec, without_bookkeeping
 from giril_rl.envs.stdout import silent_stdout
 from giril_rl.errors import UserError
@@ -163,15 +164,22 @@ class GymVectorEnv(BatchedEnv):
             state: what :meth:`simulator_state` returned for an equal environment.
 
         Raises:
+            ValueError: if it is no state of such an environment; nothing is played then.
             UserError: if the replay ends elsewhere, which means that the simulator does not
                 repeat itself for the same seed and actions.
         """
-        self._root_seed = int(state["seed"])
-        self._episode = state["episode"].numpy().copy()
-        self._steps = state["steps"].numpy().copy()
+        saved = saved_array(state, "observation", self._last_observation)
+        self._root_seed = saved_seed(state)
+        self._episode = saved_array(state, "episode", self._episode)
+        self._steps = saved_array(state, "steps", self._steps)
         self._restore_clocks(state)
         steps = self._replayed()
-        actions = state["actions"].numpy()
+        actions = saved_tensor(state, "actions")
+        check_counts("episode", self._episode, 1)
+        check_counts("steps", steps, 0, len(actions))
+        if steps.max():
+            count = getattr(self.action_spec.space, "n", None)
+            check_actions(actions, self.action_spec.shape, self._bounds, count)
         self._actions = list(actions) if steps.max() else []
         observation = np.empty_like(self._last_observation)
         with silent_stdout():
@@ -181,7 +189,7 @@ class GymVectorEnv(BatchedEnv):
                 self._episode[i] += 1
                 for action in actions[len(actions) - steps[i] :]:
                     observation[i] = env.step(action[i])[0]
-        if not np.array_equal(observation, state["observation"].numpy()):
+        if not np.array_equal(observation, saved):
             raise UserError(NOT_REPEATING)
         self._last_observation = observation
         self._started = self._restored = True

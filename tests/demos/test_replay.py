@@ -1,7 +1,13 @@
+import gymnasium
 import pytest
 from counter import Counter
 
-from giril_rl.demos import Demonstration, check_demonstration, verify_by_replay
+from giril_rl.demos import (
+    Demonstration,
+    check_demonstration,
+    record_demonstration,
+    verify_by_replay,
+)
 from giril_rl.errors import UserError
 
 
@@ -31,6 +37,16 @@ def test_wrong_reward_and_end_are_found(demo, make_fn):
         verify_by_replay(Demonstration(data, demo.card), make_fn)
     with pytest.raises(UserError, match=r"index 4 \(next terminated"):
         verify_by_replay(demo, lambda: Counter(horizon=6))
+
+
+def test_an_integer_that_is_no_action_is_not_played():
+    def make_fn():
+        return gymnasium.make("CartPole-v1")
+
+    demo = record_demonstration(make_fn, lambda o: o.new_ones(1).long(), episodes=1, seed=0)
+    demo.transitions["action"][3] = 2
+    with pytest.raises(UserError, match=r"has the action 2 at index 3, and .* none but 0 to 1"):
+        verify_by_replay(demo, make_fn)
 
 
 def test_seeds_must_fit(demo, make_fn):

@@ -1,3 +1,5 @@
+import re
+
 import gymnasium
 import numpy as np
 import pytest
@@ -268,6 +270,67 @@ def test_a_replay_that_ends_elsewhere_is_refused():
     state["actions"] = state["actions"].clone().fill_(3)
     with pytest.raises(UserError, match="does not repeat itself"):
         AtariEnv("breakout", 1).restore_simulator(state)
+
+
+@pytest.fixture(scope="module")
+def saved():
+    env = AtariEnv("breakout", 2, frame_cap=400)
+    play(env, 12)
+    return env.simulator_state()
+
+
+def with_action(where, action):
+    def change(state):
+        state["actions"][where] = action
+
+    return change
+
+
+DAMAGED = {
+    "an action beyond the last": (with_action((0, 3), 4), "not between 0 and 3"),
+    "a large action": (with_action((1, 0), 32767), "not between 0 and 3"),
+    "an action below -1": (with_action((0, 3), -2), "not between 0 and 3"),
+    "a gap": (with_action((0, 3), -1), "with -1 after the last"),
+    "real actions": (lambda s: s.update(actions=s["actions"].float()), "not int16"),
+    "actions of three games": (lambda s: s.update(actions=s["actions"][[0, 1, 1]]), "not int16"),
+    "one action": (lambda s: s.update(actions=s["actions"][0, 0]), "not int16 of shape [2, time]"),
+    "more actions than a game has": (
+        lambda s: s.update(actions=torch.zeros(2, 101, dtype=torch.int16)),
+        "more than the 100 steps",
+    ),
+    "no actions": (lambda s: s.pop("actions"), "'actions' is not a tensor"),
+    "lives of another type": (lambda s: s.update(lives=s["lives"].float()), "'lives' is not int64"),
+    "words": (lambda s: s.update(between="no"), "'between' is not a tensor"),
+    "small frames": (
+        lambda s: s.update(observation=s["observation"][..., :80]),
+        "'observation' is not uint8 of shape [2, 4, 84, 84]",
+    ),
+    "games that never began": (lambda s: s["episode"].zero_(), "'episode' is not at least 1"),
+    "a seed below zero": (lambda s: s.update(seed=-1), "seed is not a natural number"),
+    "a seed that is none": (lambda s: s.update(seed=True), "seed is not a natural number"),
+}
+
+
+@pytest.mark.parametrize("case", DAMAGED)
+def test_a_damaged_state_is_refused_before_anything_is_played(case, saved, monkeypatch):
+    """ale-py waits forever for what an action that it does not have leads to."""
+    change, sentence = DAMAGED[case]
+    state = {k: v.clone() if isinstance(v, torch.Tensor) else v for k, v in saved.items()}
+    env = AtariEnv("breakout", 2, frame_cap=400)
+    monkeypatch.setattr(AtariGame, "reset", None)
+    monkeypatch.setattr(AtariGame, "send", None)
+    change(state)
+    with pytest.raises(ValueError, match=re.escape(sentence)):
+        env.restore_simulator(state)
+
+
+@pytest.mark.parametrize("action", [-1, 4])
+def test_a_game_refuses_an_action_that_it_does_not_have(action):
+    game = AtariGame("breakout")
+    game.reset(seed=0)
+    with pytest.raises(ValueError, match="only 0 to 3"):
+        game.play(action)
+    assert game.play(3).lives == 5
 
 
 def test_games_of_one_batch_differ_and_a_seed_repeats_them():

@@ -284,6 +284,29 @@ def test_a_simulator_that_does_not_repeat_itself_is_refused():
 
 
 @pytest.mark.parametrize(
+    ("env_id", "changes", "sentence"),
+    [
+        ("CartPole-v1", {"actions": torch.full((3, 2), 2)}, "not ones of this task"),
+        ("CartPole-v1", {"actions": torch.zeros(3, 1).long()}, "another shape or type"),
+        ("CartPole-v1", {"actions": torch.zeros(2, 2).long()}, "'steps' is not between 0 and 2"),
+        ("CartPole-v1", {"steps": torch.zeros(2)}, "'steps' is not int64"),
+        ("CartPole-v1", {"observation": "x"}, "'observation' is not a tensor"),
+        ("CartPole-v1", {"seed": 0.5}, "not a natural number"),
+        (BULLET, {"actions": torch.full((3, 2, 1), 1.5)}, "not ones of this task"),
+        (BULLET, {"actions": torch.full((3, 2, 1), torch.nan)}, "not ones of this task"),
+        (BULLET, {"actions": torch.zeros(3, 2, 1).long()}, "another shape or type"),
+    ],
+)
+def test_a_damaged_state_is_refused_before_anything_is_played(env_id, changes, sentence):
+    env = make(env_id, 2)
+    play(env, random_actions(env, 3))
+    state = {**env.simulator_state(), **changes}
+    other = make(env_id, 2)
+    with pytest.raises(ValueError, match=sentence):
+        other.restore_simulator(state)
+
+
+@pytest.mark.parametrize(
     ("name", "space"),
     [
         ("observation", spaces.Box(0, 255, (8, 8, 3), np.uint8)),

@@ -25,6 +25,7 @@ from files import (
 
 from giril_rl.cli import main
 from giril_rl.errors import UserError
+from giril_rl.training.checkpoint import load_state, save_state
 
 CALL = '!!python/object/apply:os.system ["touch mark"]'
 BOMB = "\n".join(
@@ -106,7 +107,26 @@ def of(env_id):
     return ["eval", run_folder(text("config.yaml", json.dumps(settings)))]
 
 
+def played(**changes):
+    """A run on a game that is continued from a checkpoint with other entries."""
+    pytest.importorskip("ale_py")
+    command = ["run", "expert", "task=breakout", "task.max_episode_steps=20", "steps=32"]
+    command += ["ppo.num_envs=2", "ppo.rollout=8", "ppo.minibatch=16", "ppo.epochs=1"]
+    command += ["eval.episodes=1", "logger=null", "out=game"]
+    assert main(command) == 0
+    Path("game/result.json").unlink()
+    state = load_state("game/ppo.safetensors")
+    for key, value in changes.items():
+        state["simulator"][key][0] = value
+    save_state("game/ppo.safetensors", {**state, "steps": 16})
+    return command
+
+
 CASES = {
+    "hang: an action that the game does not have": (
+        lambda: played(actions=99),
+        "game/ppo.safetensors cannot be put back (ValueError: its actions are not between 0 and 3",
+    ),
     "pickle: a checkpoint": (lambda: resumed(pickled("ppo.safetensors")), "is damaged"),
     "pickle: a policy": (
         lambda: ["eval", run_folder(pickled("policy/model.safetensors"))],
