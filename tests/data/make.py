@@ -17,6 +17,7 @@ from giril_rl.demos import Demonstration, record_demonstration
 
 WORDS = [
     "task.env_id=CartPole-v1",
+    "task.expert_steps=5000000",
     "demo.path=demonstration",
     "demo.subsample=2",
     "steps=256",
