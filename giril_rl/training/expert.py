@@ -52,8 +52,8 @@ def train_expert(cfg: ExpertRunConfig, folder: Path) -> dict[str, Any]:
     """
     check_task(cfg)
     with Run.open(folder, asdict(cfg), recipe="expert", logger=cfg.logger) as run:
-        if run.result is not None:
-            return run.result
+        if run.finished:
+            return read_result(folder)
         env = make_env(cfg.task, cfg.ppo.num_envs, cfg.seed)
         agent = make_agent(env, cfg.ppo, cfg.seed).to(cfg.device)
         relabel = (

@@ -10,27 +10,18 @@ import yaml
 
 from giril_rl.configs import EvalConfig, TaskConfig
 from giril_rl.errors import UserError
-from giril_rl.files import read_json, write_json
+from giril_rl.files import write_json
 from giril_rl.formats import check_run_format
 from giril_rl.places import check_place
 from giril_rl.schema import leaves
 from giril_rl.training.agent import load_agent
 from giril_rl.training.evaluate import Player, evaluate_both
 from giril_rl.training.random_policy import RANDOM, RandomPolicy
+from giril_rl.training.result_file import read_result_file
 from giril_rl.untrusted import parse_yaml, read_text
 from giril_rl.validation import validate
 
 Part = TypeVar("Part")
-RESULT_KEYS: dict[str, type | tuple[type, ...]] = {
-    "method": str,
-    "task": str,
-    "seed": int,
-    "env_steps": int,
-    "episodes": int,
-    "return_mean": (int, float),
-    "config_hash": str,
-}
-"""What every ``result.json`` has, and the types."""
 
 
 def read_result(folder: Path) -> dict[str, Any]:
@@ -45,13 +36,7 @@ def read_result(folder: Path) -> dict[str, Any]:
         raise UserError(
             f"{folder} holds no finished run (no result.json): run it to its end first."
         )
-    result = read_json(path)
-    for key, kind in RESULT_KEYS.items():
-        if not isinstance(result.get(key), kind):
-            raise UserError(
-                f"{path} has no {key} as a run writes it: restore a copy, or make the run anew."
-            )
-    return result
+    return read_result_file(path)
 
 
 def read_settings(folder: Path) -> tuple[TaskConfig, EvalConfig]:
@@ -147,7 +132,8 @@ def print_scores(folder: Path) -> None:
 
 def _print_both(scores: dict[str, Any]) -> None:
     print(describe("sampled", scores))
-    print(describe("deterministic", scores["deterministic"]))
+    if scores.get("deterministic") is not None:  # Runs of an early version have none.
+        print(describe("deterministic", scores["deterministic"]))
 
 
 def describe(kind: str, scores: dict[str, Any]) -> str:

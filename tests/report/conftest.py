@@ -40,6 +40,7 @@ def made(tmp_path):
         (folder / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
         if score is None:
             return folder
+        lengths = {"return_std": 1.0, "return_median": score, "episode_length_mean": 100.0}
         has_demo = recipe not in ("expert", "control")
         values = {
             "method": method,
@@ -49,8 +50,9 @@ def made(tmp_path):
             "seeds": {"policy": config.seed, "reward": config.seed + 100},
             "env_steps": trained,
             "return_mean": score,
+            **lengths,
             "episodes": 20,
-            "deterministic": {"return_mean": score if mode is None else mode},
+            "deterministic": {**lengths, "return_mean": score if mode is None else mode},
             "expert_return_mean": 900.0 if has_demo else None,
             "demo_return_mean": 1000.0 if has_demo else None,
             "wall_seconds": 1.0,

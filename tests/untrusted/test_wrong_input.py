@@ -53,6 +53,26 @@ def reported(change):
     return lambda: ["report", str(Path(run_folder(change)).parent.resolve())]
 
 
+MODE = {"return_mean": 1.0, "return_std": 0.0, "return_median": 1.0}
+RESULTS = {
+    "seeds that are a list": ("seeds", {"seeds": [1]}),
+    "a seed that is text": ("seeds.reward", {"seeds": {"reward": "1"}}),
+    "a name that is a seed's": ("seeds", {"seeds": {"\n": "1"}}),
+    "a mode that is text": ("deterministic", {"deterministic": "x"}),
+    "a mode without its length": ("deterministic.episode_length_mean", {"deterministic": MODE}),
+    "an expert's score that is text": ("expert_return_mean", {"expert_return_mean": "x"}),
+    "a score that is NaN": ("return_mean", {"return_mean": float("nan")}),
+    "an infinite score": ("demo_return_mean", {"demo_return_mean": float("inf")}),
+    "a score that is a truth": ("return_mean", {"return_mean": True}),
+    "a score beyond all numbers": ("return_median", {"return_median": 10**400}),
+    "episodes below zero": ("episodes", {"episodes": -1}),
+    "steps beyond all numbers": ("env_steps", {"env_steps": 10**20}),
+    "a speed that is text": ("steps_per_second", {"steps_per_second": "1"}),
+    "a life that is text": ("life_length_mean", {"life_length_mean": "1"}),
+    "a method of two lines": ("method", {"method": "giril\n# Results"}),
+}
+
+
 def number(name, value, row=3):
     """Puts a number into one of a demonstration's columns, in all places where it belongs."""
 
@@ -352,6 +372,19 @@ LEFT_BEHIND = {
     "report: nowhere": (lambda: ["report", "nowhere"], "there is no folder nowhere"),
     "report: no runs": (lambda: ["report", "."], "there is no finished run below ."),
     "report: result cut short": (reported(cut("result.json")), "cannot be read as JSON"),
+    **{
+        f"{command}: {name} in a result": (
+            does(entries("result.json", **change)),
+            f"has no {key} as a run writes it",
+        )
+        for command, does in (("eval", evaluated), ("report", reported))
+        for name, (key, change) in RESULTS.items()
+    },
+    "report: no deviation": (
+        reported(entries("result.json", drop=["return_std"])),
+        "has no return_std",
+    ),
+    "eval: no deviation": (evaluated(entries("result.json", drop=["return_std"])), "no return_std"),
     "report: result of nothing": (reported(text("result.json", "{}")), "has no method"),
     "report: of a later format": (
         reported(entries("versions.json", format_version=2)),
