@@ -86,7 +86,7 @@ def _pictures(panel: Panel, row: Row, run: RunRecord, out: Path) -> str:
     """Draws a run's two pictures; their Markdown."""
     task, scoring = read_settings(run.folder)
     model = GenerativeReward.from_pretrained(run.folder / REWARD)
-    demo = find_demonstration(run.folder)
+    demo = find_demonstration(run.folder, run.below)
     most = MOST_STEPS if model.beta == 1 else MOST_STEPS_LITERAL
     agent = load_agent(run.folder, task)
     game = play_game(agent, task, seed=scoring.seed, most=most)
@@ -119,7 +119,9 @@ def _pictures(panel: Panel, row: Row, run: RunRecord, out: Path) -> str:
     )
 
 
-_NO_DEMONSTRATION = "Its demonstration is not there any more, so all transitions are the policy's."
+_NO_DEMONSTRATION = (
+    "Its demonstration is not in the folder reported on, so all transitions are the policy's."
+)
 
 
 def _names(panel: Panel, row: Row) -> tuple[str, ...]:

@@ -25,12 +25,14 @@ class RunRecord:
         name: the folder as seen from the folder that is reported on.
         config: its settings as ``{dotted key: value}``.
         result: what ``result.json`` holds, None for an unfinished run.
+        below: the folder that is reported on.
     """
 
     folder: Path
     name: str
     config: dict[str, Any]
     result: dict[str, Any] | None
+    below: Path
 
     @property
     def recipe(self) -> str:
@@ -97,7 +99,7 @@ def read_runs(folder: Path) -> tuple[list[RunRecord], list[Unfinished]]:
             result = read_result(path.parent)
         else:
             check_run_format(path.parent)
-        record = RunRecord(path.parent, name, config, result)
+        record = RunRecord(path.parent, name, config, result, folder)
         if record.result is not None:
             finished.append(record)
         else:

@@ -2,50 +2,86 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from giril_rl.configs import DemoConfig, ExpertConfig, RunConfig, TaskConfig
 from giril_rl.demos import Demonstration
+from giril_rl.errors import UserError
 from giril_rl.naming import config_hash
 from giril_rl.training.expert import demonstration_place, expert_settings
 from giril_rl.training.finished import read_config, read_part, read_result
 
 
-def find_demonstration(folder: Path) -> Demonstration | None:
+def find_demonstration(folder: Path, within: Path) -> Demonstration | None:
     """The demonstration of a finished run where it is still there; none is recorded for want of it.
 
-    It is looked for in the run's ``root`` and, for runs that were moved or copied since, in each
-    folder above the run's.
+    It is looked for where the run's settings say, and, for runs that were moved or copied since and
+    for settings of another current directory, in the same way in each folder from the run's up to
+    ``within``. The settings of a run that somebody sent may name any file, so nothing that lies
+    elsewhere is read.
 
     Args:
         folder: the run's folder.
+        within: the folder above it outside of which nothing is read.
 
     Returns:
-        The demonstration, or None if it is gone, or is another one than at the time of the run.
+        The demonstration, or None if it is not there, or is another one than at the time of the
+        run.
 
     Raises:
-        UserError: if it is there and damaged.
+        UserError: if it is there and damaged, or the run's settings are not what a run writes.
     """
     config, result = read_config(folder), read_result(folder)
-    demo = read_part(folder, config, "demo", DemoConfig)
-    for place in _places(folder, config, demo):
-        if (place / "card.json").is_file():
+    for place in _places(folder, within, config):
+        if _is_inside(place / "card.json", within):
             found = Demonstration.load(place)
             return found if len(found) == result.get("demo_transitions") else None
     return None
 
 
-def _places(folder: Path, config: dict[str, Any], demo: DemoConfig) -> list[Path]:
+def _places(folder: Path, within: Path, config: dict[str, Any]) -> Iterator[Path]:
+    """Where the demonstration may lie."""
+    demo = read_part(folder, config, "demo", DemoConfig)
     if demo.path is not None:
-        return [Path(demo.path)]
+        yield from _readings(demo.path, folder, within)
+        return
+    root = config.get("root", "runs")
+    if not isinstance(root, str):
+        raise UserError(f"{folder / 'config.yaml'}: root={root}: text is needed.")
     task = read_part(folder, config, "task", TaskConfig)
     expert = read_part(folder, config, "expert", ExpertConfig)
+    made_by = None
     if expert.path is None:
         made_by = config_hash(expert_settings(RunConfig(task=task), expert))
-    elif (Path(expert.path) / "result.json").is_file():
-        made_by = str(read_result(Path(expert.path))["config_hash"])
     else:
-        return []
-    roots = [Path(config.get("root", "runs")), *folder.resolve().parents]
-    return [root / demonstration_place(task, demo, made_by) for root in roots]
+        for place in _readings(expert.path, folder, within):
+            if _is_inside(place / "result.json", within):
+                made_by = str(read_result(place)["config_hash"])
+                break
+    if made_by is not None:
+        below = demonstration_place(task, demo, made_by)
+        for place in (*_readings(root, folder, within), *_above(folder, within)):
+            yield place / below
+
+
+def _readings(path: str, folder: Path, within: Path) -> Iterator[Path]:
+    """What a path in a run's settings may mean: as it is, and below each folder above the run's."""
+    yield Path(path)
+    for above in _above(folder, within):
+        yield above / path
+
+
+def _above(folder: Path, within: Path) -> list[Path]:
+    """The folders above a run's, up to and with ``within``."""
+    top = within.resolve()
+    return [path for path in folder.resolve().parents if path.is_relative_to(top)]
+
+
+def _is_inside(file: Path, within: Path) -> bool:
+    """Whether there is such a file, wherever links lead, below ``within``."""
+    try:
+        return file.resolve().is_relative_to(within.resolve()) and file.is_file()
+    except (OSError, ValueError, RuntimeError):  # A null byte, a name too long, links in a circle.
+        return False

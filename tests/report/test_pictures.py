@@ -73,7 +73,7 @@ def test_the_lowest_seed_of_a_row_has_two_pictures(run, made, capsys):
     assert all(content.startswith(b"\x89PNG") for content in pictures.values())
     about = r"^GIRIL \(released\), seed 1, 49,999,872 steps: `giril/breakout/task=.*,seed=1`; "
     assert re.search(about + r"a whole game of \d+ steps, seed 10000\.$", section, re.M)
-    assert "not there any more" not in section
+    assert "not in the folder" not in section
     assert report(made, capsys) == (section, pictures)
 
 
@@ -82,7 +82,8 @@ def test_without_its_demonstration_a_run_shows_its_policy(run, made, capsys):
     section, pictures = report(made, capsys)
     assert len(pictures) == 2
     assert (
-        "Its demonstration is not there any more, so all transitions are the policy's." in section
+        "Its demonstration is not in the folder reported on, so all transitions are the policy's."
+        in section
     )
     assert not (made.root / "demos").exists() and not (made.root / "expert").exists()
 

@@ -1,8 +1,10 @@
 """What a run's folder gives back of its demonstration."""
 
 import json
+import os
 import shutil
 from dataclasses import asdict
+from pathlib import Path
 
 import pytest
 import torch
@@ -11,6 +13,8 @@ from tensordict import TensorDict
 
 from giril_rl.compose import resolved
 from giril_rl.demos import Demonstration
+from giril_rl.errors import UserError
+from giril_rl.naming import config_hash
 from giril_rl.recipe_config import config_class
 from giril_rl.recipes import find
 from giril_rl.training import expert, fitted
@@ -19,7 +23,8 @@ from giril_rl.training.fitted import find_demonstration
 pytest.importorskip("ale_py")
 KEY = ("next", "intrinsic_reward")
 RESULT = {"method": "giril", "task": "breakout", "seed": 3, "env_steps": 1, "episodes": 1}
-RESULT |= {"return_mean": 0.0, "config_hash": "ba9876543210", "demo_transitions": 6}
+RESULT |= {"return_mean": 0.0, "return_std": 0.0, "return_median": 0.0}
+RESULT |= {"episode_length_mean": 1.0, "config_hash": "ba9876543210", "demo_transitions": 6}
 
 
 @pytest.fixture
@@ -63,33 +68,95 @@ def test_the_demonstration_is_found_and_never_made(made, tmp_path, monkeypatch):
     folder, cfg = made("giril")
     made_by = "0123456789ab"
     monkeypatch.setattr(fitted, "config_hash", lambda _: made_by)
-    assert find_demonstration(folder) is None
+    assert find_demonstration(folder, tmp_path) is None
     assert {path.name for path in tmp_path.iterdir()} == {"giril"}
     place = tmp_path / expert.demonstration_place(cfg.task, cfg.demo, made_by)
     Demonstration(transitions()).save(place)
-    found = find_demonstration(folder)
+    found = find_demonstration(folder, tmp_path)
     assert torch.equal(found.transitions["observation"], transitions()["observation"])
     moved = tmp_path / "elsewhere"
     moved.mkdir()
     for name in ("giril", "demos"):
         (tmp_path / name).rename(moved / name)
     folder = moved / folder.relative_to(tmp_path)
-    assert len(find_demonstration(folder)) == 6
+    assert len(find_demonstration(folder, tmp_path)) == 6
+    assert len(find_demonstration(folder, moved)) == 6
+    assert find_demonstration(folder, moved / "giril") is None  # Beside what is reported on.
     (folder / "result.json").write_text(json.dumps({**RESULT, "demo_transitions": 7}))
-    assert find_demonstration(folder) is None  # Another one lies there by now.
+    assert find_demonstration(folder, tmp_path) is None  # Another one lies there by now.
 
 
 def test_a_demonstration_or_an_expert_may_be_given_by_its_path(made, tmp_path):
     folder, _ = made("giril", f"demo.path={tmp_path}/given")
-    assert find_demonstration(folder) is None
+    assert find_demonstration(folder, tmp_path) is None
     Demonstration(transitions()).save(tmp_path / "given")
-    assert len(find_demonstration(folder)) == 6
+    assert len(find_demonstration(folder, tmp_path)) == 6
     shutil.rmtree(tmp_path / "giril")
     folder, cfg = made("giril", f"expert.path={tmp_path}/expert")
     place = tmp_path / expert.demonstration_place(cfg.task, cfg.demo, "ba9876543210")
     (tmp_path / "given").rename(tmp_path / "moved")
     Demonstration.load(tmp_path / "moved").save(place)
-    assert find_demonstration(folder) is None
+    assert find_demonstration(folder, tmp_path) is None
     (tmp_path / "expert").mkdir()
     (tmp_path / "expert" / "result.json").write_text(json.dumps(RESULT))
-    assert len(find_demonstration(folder)) == 6
+    assert len(find_demonstration(folder, tmp_path)) == 6
+
+
+@pytest.mark.parametrize("current", [".", "study", "study/giril", "/"])
+def test_a_relative_root_is_found_from_any_current_directory(made, tmp_path, monkeypatch, current):
+    folder, cfg = made("giril")
+    set_to(folder, "root", "study/mine")
+    made_by = config_hash(expert.expert_settings(cfg, cfg.expert))
+    place = expert.demonstration_place(cfg.task, cfg.demo, made_by)
+    Demonstration(transitions()).save(tmp_path / "study/mine" / place)
+    (tmp_path / "giril").rename(tmp_path / "study/giril")
+    folder = tmp_path / "study" / folder.relative_to(tmp_path)
+    monkeypatch.chdir(tmp_path / current)
+    assert len(find_demonstration(folder, tmp_path)) == 6
+    (tmp_path / "study/mine/demos").rename(tmp_path / "study/demos")
+    assert len(find_demonstration(folder, tmp_path / "study")) == 6
+    within = Path(os.path.relpath(tmp_path / "study"))
+    assert len(find_demonstration(within / folder.relative_to(tmp_path / "study"), within)) == 6
+
+
+@pytest.mark.parametrize("key", ["demo.path", "expert.path", "root"])
+@pytest.mark.parametrize("kind", ["absolute", "up", "link"])
+def test_nothing_outside_the_folder_is_read(made, tmp_path, monkeypatch, key, kind):
+    folder, cfg = made("giril")
+    within, outside = tmp_path / "giril", tmp_path / "outside"
+    made_by = config_hash(expert.expert_settings(cfg, cfg.expert))
+    demo = outside
+    if key == "expert.path":
+        outside.mkdir()
+        (outside / "result.json").write_text(json.dumps(RESULT))
+        demo = within / expert.demonstration_place(cfg.task, cfg.demo, RESULT["config_hash"])
+    elif key == "root":
+        demo = outside / expert.demonstration_place(cfg.task, cfg.demo, made_by)
+    Demonstration(transitions()).save(demo)
+    (within / "link").symlink_to(outside)
+    value = {"absolute": str(outside), "up": "../outside", "link": "link"}[kind]
+    set_to(folder, key, value)
+    monkeypatch.chdir(within)
+    assert find_demonstration(folder, within) is None
+    if key == "expert.path":  # Which is what would have been found.
+        set_to(folder, key, str(outside))
+        assert len(find_demonstration(folder, tmp_path)) == 6
+
+
+@pytest.mark.parametrize("key", ["demo.path", "expert.path", "root"])
+def test_a_place_that_is_none_is_refused_or_not_there(made, key):
+    folder, _ = made("giril")
+    for value in (5, ["x"], {"a": 1}, True):
+        set_to(folder, key, value)
+        with pytest.raises(UserError, match=rf"config\.yaml: {key}=.* is needed\.$"):
+            find_demonstration(folder, folder)
+    for value in ("\0", "x" * 5000, "/dev/zero", "~", ""):
+        set_to(folder, key, value)
+        assert find_demonstration(folder, folder) is None
+
+
+def set_to(folder, key, value):
+    config = yaml.safe_load((folder / "config.yaml").read_text())
+    part, _, name = key.rpartition(".")
+    (config[part] if part else config)[name] = value
+    (folder / "config.yaml").write_text(yaml.safe_dump(config))
