@@ -8,6 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+from giril_rl.study.child import gentle_signal
 from giril_rl.study.plan import StudyRun
 
 
@@ -15,14 +16,13 @@ class LocalLauncher:
     """Starts each run as a process of its own, its output in a log file.
 
     A process is the leader of its own group, so that Ctrl-C in the terminal reaches it only through
-    :meth:`interrupt`.
+    :meth:`interrupt`. Should this process be killed, the runs save their state and stop: see
+    :mod:`giril_rl.study.child`.
     """
 
     def __init__(self) -> None:
         self._running: dict[str, tuple[StudyRun, subprocess.Popen[bytes]]] = {}
-        # A process that was started in the background ignores SIGINT, and so do its children.
-        ignored = signal.getsignal(signal.SIGINT) in (signal.SIG_IGN, None)
-        self._gently = signal.SIGTERM if ignored else signal.SIGINT
+        self._gently = gentle_signal()
 
     @property
     def slots(self) -> int:
@@ -40,8 +40,8 @@ class LocalLauncher:
             output.write(f"\n$ giril {' '.join(run.command)}\n".encode())
             output.flush()
             process = subprocess.Popen(
-                [sys.executable, "-m", "giril_rl.cli", *run.command],
-                stdin=subprocess.DEVNULL,
+                [sys.executable, "-m", "giril_rl.study.child", *run.command],
+                stdin=subprocess.PIPE,
                 stdout=output,
                 stderr=subprocess.STDOUT,
                 # Numerical libraries would each take all cores.
@@ -55,7 +55,7 @@ class LocalLauncher:
         ended = [(run, process.poll()) for run, process in self._running.values()]
         found = [(run, code) for run, code in ended if code is not None]
         for run, _ in found:
-            del self._running[run.name]
+            self._forget(self._running.pop(run.name)[1])
         return found
 
     def interrupt(self) -> None:
@@ -71,7 +71,12 @@ class LocalLauncher:
         self.kill()
         for _, process in self._running.values():
             process.wait()
+            self._forget(process)
         self._running.clear()
+
+    def _forget(self, process: subprocess.Popen[bytes]) -> None:
+        if process.stdin is not None:
+            process.stdin.close()
 
     def _send(self, number: signal.Signals) -> None:
         for _, process in self._running.values():

@@ -176,6 +176,34 @@ def test_a_second_ctrl_c_kills(study):
     assert {run["state"] for run in status()["runs"]} == {"interrupted"}
 
 
+def test_runs_of_a_study_that_is_killed_save_and_stop(study):
+    name = study("groups: [{label: a, recipe: fake.py, how: slow, seed: [0, 1]}]")
+    process = subprocess.Popen(
+        [sys.executable, "-m", "giril_rl.cli", "study", name, "jobs=2"],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )
+    try:
+        wait_until(lambda: len(found("ready")) == 2)
+    finally:
+        process.kill()
+        process.wait()
+    wait_until(lambda: len(found("saved")) == 2)
+    logs = [FOLDER / run["log"] for run in status()["runs"]]
+    wait_until(lambda: all("giril: interrupted." in log.read_text() for log in logs))
+    assert all("the study's process is gone" in log.read_text() for log in logs)
+    assert main(["study", name, "jobs=2"]) == 0
+    assert status()["states"] == {"finished": 2}
+
+
+def wait_until(true):
+    deadline = time.monotonic() + 120
+    while not true():
+        assert time.monotonic() < deadline
+        time.sleep(0.05)
+
+
 def test_a_run_that_another_process_makes_is_waited_for(study):
     name = study("groups: [{label: a, recipe: fake.py, seed: [0, 1]}]")
     runs = Planner(Path("runs")).plan(read_spec(Path(name)))

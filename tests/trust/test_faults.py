@@ -2,6 +2,7 @@
 
 import os
 import random
+import re
 import signal
 import subprocess
 import sys
@@ -194,18 +195,51 @@ def commands(mark):
     return found
 
 
-@pytest.mark.slow
-def test_a_worker_that_dies_is_listed_and_the_others_go_on(tmp_path):
-    (tmp_path / "mine.yaml").write_text(STUDY)
-    root = tmp_path / "runs of this test"
-    command = ["study", str(tmp_path / "mine.yaml"), "jobs=2", "retries=0", f"root='{root}'"]
+def begun(folder):
+    """The study's process, and the root of its runs."""
+    (folder / "mine.yaml").write_text(STUDY)
+    root = folder / "runs of this test"
+    command = ["study", str(folder / "mine.yaml"), "jobs=2", "retries=0", f"root='{root}'"]
     process = subprocess.Popen(
         [sys.executable, "-m", "giril_rl.cli", *command],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
-        cwd=tmp_path,
+        cwd=folder,
     )
+    return process, root
+
+
+@pytest.mark.slow
+def test_runs_save_and_stop_when_their_study_is_killed(tmp_path):
+    process, root = begun(tmp_path)
+    try:
+        deadline = time.monotonic() + 300
+        while not list(root.rglob("ppo.safetensors")) or not list(root.rglob("result.json")):
+            assert process.poll() is None, process.stderr.read()
+            assert time.monotonic() < deadline
+            time.sleep(0.1)
+    finally:
+        process.kill()
+        process.wait()
+    deadline = time.monotonic() + 60
+    while commands(str(root)):
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
+    assert_readable(root)
+    (log,) = [
+        text for path in root.rglob("*.log") if "interrupted at" in (text := path.read_text())
+    ]
+    assert "the study's process is gone" in log
+    assert "1,280,000 steps: the same command continues from there." in log
+    taken = int(re.search(r"interrupted at ([\d,]+) of", log)[1].replace(",", ""))
+    (folder,) = [path.parent for path in root.rglob("ppo.safetensors") if "seed0" in str(path)]
+    assert load_state(folder / "ppo.safetensors")["steps"] == taken > 0
+
+
+@pytest.mark.slow
+def test_a_worker_that_dies_is_listed_and_the_others_go_on(tmp_path):
+    process, root = begun(tmp_path)
     try:
         deadline = time.monotonic() + 300
         while not (
