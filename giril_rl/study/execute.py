@@ -17,8 +17,9 @@ from filelock import FileLock, Timeout
 from giril_rl.errors import INTERRUPTED
 from giril_rl.progress import progress
 from giril_rl.study.config import StudyConfig
+from giril_rl.study.logs import last_line
 from giril_rl.study.plan import StudyRun
-from giril_rl.study.status import StudyFolder, last_line
+from giril_rl.study.status import StudyFolder
 
 PAUSE = 0.1  # seconds between looks at the runs
 

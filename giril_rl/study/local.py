@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 from giril_rl.study.child import gentle_signal
+from giril_rl.study.logs import begin_log
 from giril_rl.study.plan import StudyRun
 
 
@@ -35,10 +36,8 @@ class LocalLauncher:
 
     def start(self, run: StudyRun, log: Path) -> None:
         """Start a run; what it prints is added to ``log``."""
-        log.parent.mkdir(parents=True, exist_ok=True)
+        begin_log(log, run.command)
         with open(log, "ab") as output:
-            output.write(f"\n$ giril {' '.join(run.command)}\n".encode())
-            output.flush()
             process = subprocess.Popen(
                 [sys.executable, "-m", "giril_rl.study.child", *run.command],
                 stdin=subprocess.PIPE,

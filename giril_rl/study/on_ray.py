@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from giril_rl.errors import INTERRUPTED, UserError
+from giril_rl.study.logs import begin_log
 from giril_rl.study.plan import StudyRun
 
 KILLED = -int(signal.SIGKILL)
@@ -107,9 +108,8 @@ def run_in_worker(command: list[str], log: str, folder: str) -> int:
         folder: the working directory.
     """
     os.chdir(folder)
-    Path(log).parent.mkdir(parents=True, exist_ok=True)
+    begin_log(Path(log), command)
     with open(log, "a", buffering=1, encoding="utf-8") as output:
-        output.write(f"\n$ giril {' '.join(command)}\n")
         # Both what Python prints and what a simulator writes to the bare descriptors.
         for descriptor in (1, 2):
             os.dup2(output.fileno(), descriptor)

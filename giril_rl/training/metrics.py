@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import json
 import math
+import os
 import zlib
 from collections.abc import Mapping
 from pathlib import Path
@@ -57,7 +58,7 @@ class MetricsFile:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        if path.exists() and not path.read_bytes().endswith(b"\n"):
+        if path.exists() and not _ends_a_line(path):
             self._rewrite(read_metrics(path))
 
     def write(self, phase: str, step: int, values: Mapping[str, float]) -> None:
@@ -81,6 +82,13 @@ class MetricsFile:
 
     def _rewrite(self, rows: list[dict[str, Any]]) -> None:
         write_atomically(self.path, "".join(json.dumps(row) + "\n" for row in rows))
+
+
+def _ends_a_line(path: Path) -> bool:
+    """Whether a file's last byte is a newline; nothing else of it is read."""
+    with open(path, "rb") as file:
+        file.seek(max(os.fstat(file.fileno()).st_size - 1, 0))
+        return file.read() == b"\n"
 
 
 def check_logger(name: str | None) -> None:
