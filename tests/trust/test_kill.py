@@ -19,11 +19,11 @@ class Undisturbed:
     def __init__(self, nursery, folder):
         self.nursery, self.folder, self.known = nursery, folder, {}
 
-    def __call__(self, recipe):
+    def __call__(self, recipe, **more):
         if recipe not in self.known:
             root = self.folder / recipe
             began = time.monotonic()
-            ended = self.nursery.run(words(recipe, root), root=str(root))
+            ended = self.nursery.run(words(recipe, root, **more), root=str(root))
             assert ended.code == 0, ended.words
             assert_readable(root)
             self.known[recipe] = contents(root), ended.points, time.monotonic() - began
@@ -35,17 +35,17 @@ def undisturbed(nursery, tmp_path_factory):
     return Undisturbed(nursery, tmp_path_factory.mktemp("undisturbed"))
 
 
-def live(nursery, recipe, root, **points):
+def live(nursery, recipe, root, more=(), **points):
     """One life of a run; whether it came to its end."""
-    ended = nursery.run(words(recipe, root), root=str(root), **points)
+    ended = nursery.run(words(recipe, root, **dict(more)), root=str(root), **points)
     assert ended.code in (0, KILLED), ended.words
     assert_readable(root)
     return ended.code == 0
 
 
-def finish(nursery, recipe, root, expected, note):
+def finish(nursery, recipe, root, expected, note, more=()):
     """Lets a run come to its end, which must be that of the undisturbed one."""
-    assert live(nursery, recipe, root), note
+    assert live(nursery, recipe, root, more), note
     assert_same(contents(root), expected, note)
 
 
@@ -88,6 +88,25 @@ def test_a_run_that_is_killed_once(recipe, nursery, undisturbed, tmp_path):
     for point in chosen:
         killed_at(nursery, recipe, tmp_path / str(point), expected, point)
     print(f"{recipe}: {len(chosen)} kills of {points} points")
+
+
+@pytest.mark.slow
+def test_a_run_on_a_game_that_is_killed(nursery, undisturbed, tmp_path):
+    """Frames, pixel networks and games that are replayed; at points of two runs in turn."""
+    pytest.importorskip("ale_py")
+    undisturbed("player")
+    more = {"expert.path": undisturbed.folder / "player/player"}
+    expected, points, _ = undisturbed("game", **more)
+    assert "game/ppo.safetensors" in expected and any("frames" in name for name in expected)
+    chosen = random.Random(0).sample(range(1, points // 2), 6)
+    kills = 0
+    for number in range(2):
+        root = tmp_path / str(number)
+        lives = chosen[number::2]
+        kills += sum(not live(nursery, "game", root, more, kill_at=point) for point in lives)
+        finish(nursery, "game", root, expected, lives, more)
+    print(f"game: {kills} kills of {points} points")
+    assert kills >= 3
 
 
 @pytest.mark.slow

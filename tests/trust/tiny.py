@@ -25,11 +25,29 @@ RECIPES = {
     "bc": {**PPO, **DEMO, "steps": 0, "bc.steps": 2040, "bc.log_every": 120},
     "control": {**PPO, **DEMO, **FIT, "reward": "noise"},
 }
+GAME = {
+    **PPO,
+    "task": "breakout",
+    "task.env_id": None,
+    "task.max_episode_steps": 60,
+    "steps": 64,
+    "ppo.rollout": 8,
+    "ppo.minibatch": 16,
+    "ppo.hidden": None,
+    "ppo.checkpoint_every": 16,
+    "eval.episodes": 1,
+}
+GAMES = {
+    "player": {**GAME, "steps": 16, "stop_early": "false"},
+    "game": {**GAME, "demo.subsample": 2, "fit.steps": 4, "fit.batch": 4, "fit.log_every": 2},
+}
+RECIPE_OF = {"game": "giril", "player": "expert"}
 
 
 def words(recipe, root, **more):
     """The command of a recipe below ``root``; a double underscore stands for a dot."""
     given = {key.replace("__", "."): value for key, value in more.items()}
     place = {"root": root, "out": f"{root}/{recipe}"}
-    knobs = {**RECIPES[recipe], **place, **given}
-    return ["run", recipe, *(f"{k}={v}" for k, v in knobs.items() if v is not None)]
+    knobs = {**{**RECIPES, **GAMES}[recipe], **place, **given}
+    command = ["run", RECIPE_OF.get(recipe, recipe)]
+    return [*command, *(f"{k}={v}" for k, v in knobs.items() if v is not None)]
