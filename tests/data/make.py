@@ -6,14 +6,19 @@ format has a new number, and keep the old files beside the new ones.
 
 import os
 import shutil
+import zipfile
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import gymnasium
 import torch
 from tensordict import TensorDict
+from torchrl.data import Categorical
 
 from giril_rl.cli import main
 from giril_rl.demos import Demonstration, record_demonstration
+from giril_rl.networks.pixel_policy import PixelActorCritic
+from giril_rl.rewards import GenerativeReward
 
 WORDS = [
     "task.env_id=CartPole-v1",
@@ -65,12 +70,27 @@ def images() -> Demonstration:
     return Demonstration(TensorDict(transitions, [4]), {"task": "frames", "seeds": [0]})
 
 
+def pixels(archive: Path) -> None:
+    """Policy and reward of a game, as large as the paper has them, with weights that compress."""
+    spec = Categorical(4, shape=(1,), dtype=torch.int64)
+    modules = {"policy": PixelActorCritic(4), "reward": GenerativeReward.for_pixels(spec)}
+    with TemporaryDirectory() as place, zipfile.ZipFile(archive, "w", zipfile.ZIP_LZMA) as packed:
+        for name, module in modules.items():
+            for weight in module.parameters():
+                steps = torch.arange(weight.numel()) % 11 - 5
+                weight.data = (steps / (10 * weight[0].numel() ** 0.5)).reshape(weight.shape)
+            folder = module.save_pretrained(Path(place) / name, {"task": "breakout"})
+            for path in sorted(folder.iterdir()):
+                packed.write(path, f"{name}/{path.name}")
+
+
 def make(folder: Path) -> None:
     os.chdir(folder)
     for name in ("demonstration", "demonstration_of_images", "run"):
         shutil.rmtree(name, ignore_errors=True)
     vectors().save("demonstration")
     images().save("demonstration_of_images")
+    pixels(Path("pixels.zip"))
     assert main(["run", "giril", *WORDS]) == 0
     for picture in Path("run").glob("*.png"):
         picture.unlink()

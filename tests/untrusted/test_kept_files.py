@@ -1,10 +1,12 @@
 """Files that today's formats were written in are read, evaluated and reported for good."""
 
+import zipfile
 from pathlib import Path
 
 import pytest
 import torch
 from files import DATA, kept, run_folder, words
+from tensordict import TensorDict
 
 from giril_rl.cli import main
 from giril_rl.demos import Demonstration
@@ -14,6 +16,9 @@ from giril_rl.formats import check_format
 from giril_rl.networks.agents import load_agent_from
 from giril_rl.rewards import GenerativeReward
 from giril_rl.training.checkpoint import load_state
+
+LOGITS = [0.6002023, -0.7985780, 0.0336854, -0.2988219]
+PAID = [15336.5977, 15327.0957]
 
 
 def test_they_are_small():
@@ -37,6 +42,18 @@ def test_reward_and_policy_are_read_and_do_what_they_did():
     card = read_json(DATA / "run/policy/card.json")
     assert (card["method"], card["task"], card["env_steps"]) == ("giril", "CartPole-v1", 256)
     assert policy.critic(torch.zeros(1, 4)).isfinite().all()
+
+
+def test_those_of_pixels_do_what_they_did(tmp_path):
+    zipfile.ZipFile(DATA / "pixels.zip").extractall(tmp_path)
+    frames = (torch.arange(3 * 4 * 84 * 84).reshape(3, 4, 84, 84) % 251).to(torch.uint8)
+    policy = load_agent_from(tmp_path / "policy")
+    logits = policy.actor(frames[:1]).flatten()
+    assert logits.tolist() == pytest.approx(LOGITS, rel=1e-3)
+    reward = GenerativeReward.from_pretrained(tmp_path / "reward")
+    batch = TensorDict({"observation": frames[:2], "action": torch.tensor([0, 3])}, [2])
+    paid = reward(batch.set("next", {"observation": frames[1:]}))["next", "intrinsic_reward"]
+    assert paid.flatten().tolist() == pytest.approx(PAID, rel=1e-5)
 
 
 @pytest.mark.parametrize("name", ["fit", "ppo"])
