@@ -8,6 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from giril_rl.networks.painter import painted
 from giril_rl.networks.pixels import FEATURES, SIDE, SLOPE, flat_frames, xavier
 
 
@@ -19,8 +20,8 @@ class PixelDecoder(nn.Module):
     the observation, joined, go through one 3x3 convolution of dilation 2 without activation. The
     6x6 layer is the released code's: the paper's table does not reach 84x84, nor four channels.
 
-    As the state enters at the last layer only, ``decoder(a, s)`` of a one-hot ``a`` is
-    ``action_table()[a] + state_part(s)``.
+    As the state enters at the last layer only, ``decoder(code, s)`` is ``code_part(code) +
+    state_part(s)``, and that of a one-hot ``a`` is ``action_table()[a] + state_part(s)``.
 
     Args:
         actions: number of actions, the size of the code.
@@ -78,8 +79,16 @@ class PixelDecoder(nn.Module):
             torch.Size([6, 4, 84, 84])
         """
         weight = self.last.weight
-        image = self.image(torch.eye(self.actions, dtype=weight.dtype, device=weight.device))
-        half = weight[:, : self.channels]
+        return self.code_part(torch.eye(self.actions, dtype=weight.dtype, device=weight.device))
+
+    def code_part(self, code: Tensor) -> Tensor:
+        """What codes ``(n, actions)`` add to the prediction, bias included: ``(n, channels, ...)``.
+
+        Without gradient and on a CPU the image is computed by :func:`painted`.
+        """
+        fast = code.device.type == "cpu" and not torch.is_grad_enabled()
+        image = painted(self.painter, code) if fast else self.image(code)
+        half = self.last.weight[:, : self.channels]
         return F.conv2d(image, half, self.last.bias, padding=2, dilation=2)
 
     def state_part(self, observation: Tensor) -> Tensor:

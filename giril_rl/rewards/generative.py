@@ -251,14 +251,16 @@ class GenerativeReward(Pretrained, TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes each transition's reward."""
         observation, action, following = (tensordict.get(key) for key in self.in_keys)
-        if self._is_factored(observation):
+        transitions = (observation, action, following)
+        if not self._is_factored(observation):
+            error = per_transition(self._error, transitions, self.scaler.event_dims)
+        elif self.beta < 1:
+            error = per_transition(self._blended_error, transitions, self.scaler.event_dims)
+        else:
             table, weight = self._table(cast(PixelDecoder, self.decoder))
             index = self.actions.target(action)
             clamp = self.scaler.clamp
             error = factored_error(table, weight, index, observation, following, clamp=clamp)
-        else:
-            transitions = (observation, action, following)
-            error = per_transition(self._error, transitions, self.scaler.event_dims)
         return tensordict.set(self.out_keys[0], self.scale * error.unsqueeze(-1))
 
     def _error(self, observation: Tensor, action: Tensor, following: Tensor) -> Tensor:
@@ -266,18 +268,33 @@ class GenerativeReward(Pretrained, TensorDictModuleBase):
         predicted = self._predict(observation, action, following)
         return reconstruction_error(predicted, following, self.scaler.event_dims)
 
+    def _blended_error(self, observation: Tensor, action: Tensor, following: Tensor) -> Tensor:
+        """The same where each transition has a code of its own, by the decoder's two parts."""
+        decoder, batch = cast(PixelDecoder, self.decoder), observation.shape[:-3]
+        code = self._code(self.scaler(observation), action, self.scaler(following))
+        return factored_error(
+            decoder.code_part(code.reshape(-1, code.shape[-1])),
+            decoder.state_weight,
+            torch.arange(batch.numel(), device=code.device).reshape(batch),
+            observation,
+            following,
+            clamp=self.scaler.clamp,
+        )
+
     def _predict(self, observation: Tensor, action: Tensor, following: Tensor) -> Tensor:
+        predicted = self.decode(self._code(observation, action, following), observation)
+        return predicted.clamp(-1.0, 1.0) if self.scaler.clamp else predicted
+
+    def _code(self, observation: Tensor, action: Tensor, following: Tensor) -> Tensor:
         code = self.actions(action)
         if self.beta < 1:
             code = blend_action(code, self._encoded_action(observation, following), self.beta)
-        predicted = self.decode(code, observation)
-        return predicted.clamp(-1.0, 1.0) if self.scaler.clamp else predicted
+        return code
 
     def _is_factored(self, observation: Tensor) -> bool:
         """Whether the decoder's two parts can be computed apart: exact, but without gradient."""
         return (
-            self.beta == 1
-            and isinstance(self.decoder, PixelDecoder)
+            isinstance(self.decoder, PixelDecoder)
             and observation.dtype == torch.uint8
             and not torch.is_grad_enabled()
         )

@@ -4,6 +4,7 @@ import torch.nn.functional as F
 from torch import nn
 
 from giril_rl.errors import UserError
+from giril_rl.networks.painter import painted
 from giril_rl.networks.pixel_decoder import PixelDecoder
 
 
@@ -55,6 +56,28 @@ def test_by_hand(decoder):
     joined = F.pad(torch.cat((x, s), 1), (2, 2, 2, 2))
     expected = F.conv2d(joined, decoder.last.weight, decoder.last.bias, dilation=2)
     torch.testing.assert_close(decoder(code, s), expected)
+
+
+@pytest.mark.parametrize("codes", [1, 8, 19])
+def test_painted_as_convolutions_is_painted_by_transposed_ones(decoder, codes):
+    code = torch.randn(codes, 5)
+    found = painted(decoder.painter, code)
+    assert not found.requires_grad
+    torch.testing.assert_close(found, decoder.image(code).detach(), rtol=1e-5, atol=1e-5)
+    three = PixelDecoder(2, channels=3).double()
+    code = torch.randn(3, 2, dtype=torch.float64)
+    torch.testing.assert_close(
+        painted(three.painter, code, chunk=2), three.image(code).detach(), rtol=1e-12, atol=1e-12
+    )
+
+
+def test_the_codes_part_has_a_gradient_where_one_is_wanted(decoder):
+    code = torch.randn(2, 5, requires_grad=True)
+    part = decoder.code_part(code)
+    part.square().sum().backward()
+    assert code.grad.abs().min() > 0
+    with torch.no_grad():
+        torch.testing.assert_close(decoder.code_part(code), part, rtol=1e-5, atol=1e-5)
 
 
 def test_is_the_sum_of_its_two_parts(decoder):

@@ -65,6 +65,23 @@ def test_the_factored_way_is_the_literal_one(clamp, batch):
     torch.testing.assert_close(found, error.detach(), rtol=1e-5, atol=0)
 
 
+@pytest.mark.parametrize("clamp", [True, False])
+@pytest.mark.parametrize("batch", [(20,), (2, 3), ()])
+def test_with_beta_below_1_the_two_parts_are_the_literal_network(clamp, batch):
+    reward, data = model(clamp=clamp, beta=0.9, scale=0.3).eval(), transitions(*batch)
+    calls, noise = [], reward.get_extra_state()
+    reward.decoder.register_forward_hook(lambda *_: calls.append(1))
+    expected = literal(reward, data)
+    assert len(calls) == 1
+    drawn = reward.get_extra_state()
+    assert not torch.equal(drawn, noise)
+    reward.set_extra_state(noise)
+    found = factored(reward, data)
+    assert len(calls) == 1 and torch.equal(reward.get_extra_state(), drawn)
+    assert found.shape == (*batch, 1)
+    torch.testing.assert_close(found, expected, rtol=1e-5, atol=0)
+
+
 def test_the_clamp_matters_here():
     data = transitions(3)
     assert (factored(model(), data) < 0.9 * factored(model(clamp=False), data)).all()
