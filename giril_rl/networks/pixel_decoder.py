@@ -8,8 +8,11 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from giril_rl.networks.painter import painted
 from giril_rl.networks.pixels import FEATURES, SIDE, SLOPE, flat_frames, xavier
+from giril_rl.networks.upsampling import ChannelsLast, RowsTransposedConv, TransposedConv
+
+_AT_ONCE = 8
+"""Codes at a time without gradient: few enough for what is in between to stay in a CPU's cache."""
 
 
 class PixelDecoder(nn.Module):
@@ -38,16 +41,19 @@ class PixelDecoder(nn.Module):
         self.channels = channels
         layers: list[nn.Module] = []
         for before, after in pairwise((64, 64, 64, 32, 32)):
-            layers += [nn.ConvTranspose2d(before, after, 3, stride=2), nn.LeakyReLU(SLOPE)]
+            layers += [
+                TransposedConv(before, after, 3, stride=2),
+                nn.LeakyReLU(SLOPE, inplace=True),
+            ]
         self.painter = xavier(
             nn.Sequential(
                 nn.Linear(actions, 64),
                 nn.LeakyReLU(SLOPE),
                 nn.Linear(64, FEATURES),
                 nn.LeakyReLU(SLOPE),
-                nn.Unflatten(1, (64, 4, 4)),
+                ChannelsLast(1, (64, 4, 4)),
                 *layers,
-                nn.ConvTranspose2d(32, channels, 6),
+                RowsTransposedConv(32, channels, 6),
             )
         )
         self.last = xavier(nn.Conv2d(2 * channels, channels, 3, padding=2, dilation=2))
@@ -59,7 +65,11 @@ class PixelDecoder(nn.Module):
 
     def image(self, code: Tensor) -> Tensor:
         """All that happens before the last convolution: ``(*batch, channels, 84, 84)``."""
-        painted = self.painter(code.reshape(-1, self.actions))
+        codes = code.reshape(-1, self.actions)
+        if torch.is_grad_enabled() or codes.device.type != "cpu":
+            painted = self.painter(codes)
+        else:
+            painted = torch.cat([self.painter(some) for some in codes.split(_AT_ONCE)])
         return painted.reshape(*code.shape[:-1], self.channels, SIDE, SIDE)
 
     def forward(self, code: Tensor, observation: Tensor) -> Tensor:
@@ -84,12 +94,12 @@ class PixelDecoder(nn.Module):
     def code_part(self, code: Tensor) -> Tensor:
         """What codes ``(n, actions)`` add to the prediction, bias included: ``(n, channels, ...)``.
 
-        Without gradient and on a CPU the image is computed by :func:`painted`.
+        Examples:
+            >>> PixelDecoder(6).code_part(torch.rand(2, 6)).shape
+            torch.Size([2, 4, 84, 84])
         """
-        fast = code.device.type == "cpu" and not torch.is_grad_enabled()
-        image = painted(self.painter, code) if fast else self.image(code)
         half = self.last.weight[:, : self.channels]
-        return F.conv2d(image, half, self.last.bias, padding=2, dilation=2)
+        return F.conv2d(self.image(code), half, self.last.bias, padding=2, dilation=2)
 
     def state_part(self, observation: Tensor) -> Tensor:
         """What observations ``(*batch, channels, 84, 84)`` add to the prediction, same shape."""

@@ -108,7 +108,9 @@ class PixelEncoder(nn.Module):
     def forward(self, observation: Tensor, following: Tensor) -> Tensor:
         """``(*batch, 2 * actions)`` for s and s' scaled to [-1, 1], ``(*batch, 4, 84, 84)``."""
         frames = [flat_frames(x, self.channels) for x in (observation, following)]
-        out = self.head(self.body(torch.cat(frames, 1)))
+        # In that layout a CPU's convolutions take less time; the numbers are the same.
+        joined = torch.cat(frames, 1).contiguous(memory_format=torch.channels_last)
+        out = self.head(self.body(joined))
         return out.reshape(*observation.shape[:-3], *out.shape[1:])
 
 

@@ -6,13 +6,14 @@ python tests/benchmarks/pixel_reward.py [--threads 1] [--batch 1024] [--actions 
 from __future__ import annotations
 
 import argparse
+import copy
 import statistics
 import time
 from collections.abc import Callable
 
 import torch
 from tensordict import TensorDict
-from torch import Tensor
+from torch import Tensor, nn
 from torchrl.data import Categorical
 
 from giril_rl.networks.pixel_decoder import PixelDecoder
@@ -20,6 +21,20 @@ from giril_rl.rewards import GenerativeReward
 from giril_rl.rewards.chunks import PIXELS_AT_ONCE
 from giril_rl.rewards.equations import reconstruction_error
 from giril_rl.rewards.factored import factored_error
+
+
+def plain(decoder: PixelDecoder) -> PixelDecoder:
+    """The same network of torch's own layers."""
+    copied = copy.deepcopy(decoder)
+    for i, layer in enumerate(copied.painter):
+        if isinstance(layer, nn.ConvTranspose2d):
+            side, stride = layer.kernel_size[0], int(layer.stride[0])
+            own = nn.ConvTranspose2d(layer.in_channels, layer.out_channels, side, stride=stride)
+            own.load_state_dict(layer.state_dict())
+            copied.painter[i] = own
+        elif isinstance(layer, nn.Unflatten):
+            copied.painter[i] = nn.Unflatten(1, layer.unflattened_size)
+    return copied
 
 
 def literal_error(
@@ -30,7 +45,8 @@ def literal_error(
     errors = []
     for some in torch.arange(len(action)).split(chunk):
         s, after = (x[some[0] : some[-1] + 1].float() / 127.5 - 1 for x in (observation, following))
-        predicted = decoder(codes[action[some]], s).clamp_(-1, 1)
+        image = decoder.painter(codes[action[some]])  # All at once, as a network is called.
+        predicted = decoder.last(torch.cat((image, s), 1)).clamp_(-1, 1)
         errors.append(predicted.sub_(after).square_().sum((1, 2, 3)))
     return torch.cat(errors)
 
@@ -60,8 +76,10 @@ def main() -> None:
     observation, following = (torch.randint(256, shape, dtype=torch.uint8) for _ in range(2))
     data = (torch.randint(args.actions, (args.batch,)), observation, following)
 
+    torchs = plain(decoder)
+
     def literal() -> Tensor:
-        return literal_error(decoder, *data, args.literal_chunk or args.batch)
+        return literal_error(torchs, *data, args.literal_chunk or args.batch)
 
     def factored() -> Tensor:
         return factored_error(table, decoder.state_weight, *data, chunk=args.chunk)
@@ -84,6 +102,8 @@ def blended(rounds: int, action: Tensor, observation: Tensor, following: Tensor)
     """Prints the same of beta = 0.9, encoder included, where each transition has its own code."""
     actions = int(action.max()) + 1
     reward = GenerativeReward.for_pixels(Categorical(actions), beta=0.9).eval()
+    torchs = copy.deepcopy(reward)
+    torchs.decoder = plain(reward.decoder)
     data = {"observation": observation, "action": action, "next": {"observation": following}}
     batch = TensorDict(data, [len(action)])
 
@@ -93,7 +113,7 @@ def blended(rounds: int, action: Tensor, observation: Tensor, following: Tensor)
         scale = reward.scaler
         return torch.cat(
             [
-                reconstruction_error(reward.predict(s, a, after), scale(after), 3)
+                reconstruction_error(torchs.predict(s, a, after), scale(after), 3)
                 for s, a, after in parts
             ]
         )
@@ -101,9 +121,7 @@ def blended(rounds: int, action: Tensor, observation: Tensor, following: Tensor)
     def in_parts() -> Tensor:
         return reward(batch)["next", "intrinsic_reward"].squeeze(-1)
 
-    noise = reward.get_extra_state()
     slow = literal()
-    reward.set_extra_state(noise)
     difference = ((in_parts() - slow) / slow).abs().max().item()
     times = [(seconds(literal), seconds(in_parts)) for _ in range(rounds)]
     for name, taken in zip(("literal", "in parts"), zip(*times, strict=True), strict=True):
