@@ -55,7 +55,9 @@ def _add_task(parser: Parser) -> None:
 
 def _show(kinds: Any) -> None:
     parser = _add(kinds, "show", _run_show)
-    parser.add_argument("path", metavar="PATH", type=Path, help="the folder of a demonstration")
+    parser.add_argument(
+        "path", metavar="PATH", type=Path, help="the folder of a demonstration, or shipped:TASK"
+    )
     parser.add_argument(
         "--out", type=Path, metavar="FILE.gif", help="write the frames of images, enlarged"
     )
@@ -102,7 +104,7 @@ def _play(kinds: Any) -> None:
 
 def _run_show(args: Namespace) -> None:
     """Print what a demonstration holds."""
-    _check_folder(args.path)
+    args.path = _found_folder(args.path)
     _check_picture(args.out, args.fps)
     from giril_rl.demos import Demonstration
     from giril_rl.demos.show import describe
@@ -130,7 +132,7 @@ def _run_import(args: Namespace) -> None:
 
 def _run_export(args: Namespace) -> None:
     """Write a demonstration for others, as a Minari dataset or a plain file."""
-    _check_folder(args.path)
+    args.path = _found_folder(args.path)
     from giril_rl.demos import Demonstration, to_minari, to_npz
 
     found = Demonstration.load(args.path)
@@ -180,12 +182,16 @@ def _run_play(args: Namespace) -> None:
     print(f"{args.out} has {len(found):,} transitions, score {found.returns.tolist()}.")
 
 
-def _check_folder(path: Path) -> None:
-    if not (path / "card.json").is_file():
+def _found_folder(path: Path) -> Path:
+    from giril_rl.demos.shipped import demonstration_folder
+
+    folder = demonstration_folder(path)
+    if not (folder / "card.json").is_file():
         raise UserError(
             f"{path} is not the folder of a demonstration: recipes keep theirs in "
             "runs/demos/TASK/HASH."
         )
+    return folder
 
 
 def _check_new(out: Path) -> None:

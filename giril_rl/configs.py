@@ -146,7 +146,11 @@ class ExpertConfig:
 class DemoConfig:
     """What is recorded from the expert and how much of it is used."""
 
-    path: str | None = knob(None, "folder of a demonstration to use instead of recording one")
+    path: str | None = knob(
+        None,
+        "folder of a demonstration to use instead of recording one; "
+        "`shipped` takes the package's own of the task",
+    )
     length: int | None = knob(
         1000, "transitions to record; null records `episodes` whole episodes", low=1
     )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
+import math
 import sys
 from collections.abc import Iterator
 from dataclasses import asdict
@@ -19,6 +20,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from giril_rl.configs import DemoConfig, ExpertConfig, ExpertRunConfig, RunConfig, TaskConfig
 from giril_rl.demos import Demonstration, check_demonstration, record_demonstration
+from giril_rl.demos.shipped import demonstration_folder
 from giril_rl.demos.task import as_recorded_task, spaces_of
 from giril_rl.envs import gym_factory, make_env, with_own_episodes
 from giril_rl.errors import UserError
@@ -140,8 +142,9 @@ def check_inputs(cfg: RunConfig, expert: ExpertConfig, demo: DemoConfig) -> None
 
 
 def _given_demonstration(task: TaskConfig, path: str) -> Demonstration:
+    folder = demonstration_folder(path, task)
     shape, spec = spaces_of(task)
-    demo = Demonstration.load(path)
+    demo = Demonstration.load(folder)
     try:
         check_demonstration(demo, shape, spec)
     except UserError as error:
@@ -154,13 +157,15 @@ def obtain_demonstration(
 ) -> tuple[Demonstration, dict[str, Any] | None]:
     """The demonstration that a recipe asks for, recorded first if need be, and its expert's result.
 
-    The latter is None for a demonstration that was given by its path.
+    Of a demonstration that was given by its path the latter has ``return_mean`` where its card
+    tells it, and is None otherwise.
 
     Raises:
         UserError: if the demonstration does not fit the task.
     """
     if demo.path is not None:
-        return _given_demonstration(cfg.task, demo.path), None
+        given = _given_demonstration(cfg.task, demo.path)
+        return given, _known_expert(given)
     source, result = obtain_expert(cfg, expert)
     task = as_recorded_task(cfg.task, demo.lives)
     folder = Path(cfg.root) / demonstration_place(cfg.task, demo, result["config_hash"])
@@ -181,6 +186,14 @@ def obtain_demonstration(
             )
             recorded.save(folder)
     return Demonstration.load(folder), result
+
+
+def _known_expert(demo: Demonstration) -> dict[str, Any] | None:
+    player = demo.card.get("expert")
+    score = player.get("return_mean") if isinstance(player, dict) else None
+    if isinstance(score, float | int) and math.isfinite(score):
+        return {"return_mean": float(score)}
+    return None
 
 
 def demonstration_place(task: TaskConfig, demo: DemoConfig, expert: str) -> Path:

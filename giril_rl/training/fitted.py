@@ -8,6 +8,7 @@ from typing import Any
 
 from giril_rl.configs import DemoConfig, ExpertConfig, RunConfig, TaskConfig
 from giril_rl.demos import Demonstration
+from giril_rl.demos.shipped import demonstration_folder, is_shipped
 from giril_rl.errors import UserError
 from giril_rl.naming import config_hash
 from giril_rl.training.expert import demonstration_place, expert_settings
@@ -34,11 +35,21 @@ def find_demonstration(folder: Path, within: Path) -> Demonstration | None:
         UserError: if it is there and damaged, or the run's settings are not what a run writes.
     """
     config, result = read_config(folder), read_result(folder)
-    for place in _places(folder, within, config):
-        if _is_inside(place / "card.json", within):
+    shipped = _shipped(folder, config)
+    places = [shipped] if shipped is not None else _places(folder, within, config)
+    for place in places:
+        if place == shipped or _is_inside(place / "card.json", within):
             found = Demonstration.load(place)
             return found if len(found) == result.get("demo_transitions") else None
     return None
+
+
+def _shipped(folder: Path, config: dict[str, Any]) -> Path | None:
+    """The package's own demonstration, if it is what the run learned from."""
+    demo = read_part(folder, config, "demo", DemoConfig)
+    if demo.path is None or not is_shipped(demo.path):
+        return None
+    return demonstration_folder(demo.path, read_part(folder, config, "task", TaskConfig))
 
 
 def _places(folder: Path, within: Path, config: dict[str, Any]) -> Iterator[Path]:

@@ -12,7 +12,7 @@ import yaml
 from tensordict import TensorDict
 
 from giril_rl.compose import resolved
-from giril_rl.demos import Demonstration
+from giril_rl.demos import Demonstration, shipped_demonstrations
 from giril_rl.errors import UserError
 from giril_rl.naming import config_hash
 from giril_rl.recipe_config import config_class
@@ -160,3 +160,13 @@ def set_to(folder, key, value):
     part, _, name = key.rpartition(".")
     (config[part] if part else config)[name] = value
     (folder / "config.yaml").write_text(yaml.safe_dump(config))
+
+
+def test_the_packages_own_demonstration_is_found(made, tmp_path):
+    folder, _ = made("giril", "demo.path=shipped")
+    shipped = Demonstration.load(shipped_demonstrations()["breakout"])
+    assert find_demonstration(folder, tmp_path) is None  # Of six transitions there is none.
+    result = {**RESULT, "demo_transitions": len(shipped)}
+    (folder / "result.json").write_text(json.dumps(result))
+    found = find_demonstration(folder, tmp_path)
+    assert (found.transitions == shipped.transitions).all()

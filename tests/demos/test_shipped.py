@@ -1,0 +1,82 @@
+"""What comes with the package is sound, small, of one life, and found by its task."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from giril_rl.cli import main
+from giril_rl.configs import DemoConfig, ExpertConfig, RunConfig, TaskConfig
+from giril_rl.demos import Demonstration, named_task, shipped_demonstrations, verify_by_replay
+from giril_rl.demos.shipped import demonstration_folder
+from giril_rl.demos.task import as_recorded_task, check_for_task
+from giril_rl.envs import gym_factory
+from giril_rl.errors import UserError
+from giril_rl.training import check_inputs, obtain_demonstration
+
+each = pytest.mark.parametrize("name", shipped_demonstrations())
+
+
+@each
+def test_one_life_of_the_task_from_its_first_state_on(name):
+    folder = shipped_demonstrations()[name]
+    assert sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()) < 2**20
+    demo, task = Demonstration.load(folder), named_task(name, None)
+    check_for_task(demo, task)
+    assert (demo.card["task"], demo.card["env_id"], demo.card["lives"]) == (
+        name,
+        task.env_id,
+        "first",
+    )
+    end = demo.transitions["next"][-1]
+    assert demo.num_episodes == 1 and end["terminated"].item() and not end["truncated"].item()
+    assert demo.transitions["step"][0] == 0
+    # Played again from its seed it is the same bits, and no other life's.
+    verify_by_replay(demo, gym_factory(as_recorded_task(task, "first")))
+
+
+@each
+def test_a_recipe_finds_it_by_its_task(name, tmp_path):
+    env_id = named_task(name, None).env_id
+    for task in (named_task(name, None), TaskConfig(name=env_id, env_id=env_id)):
+        cfg, demo = RunConfig(task=task, root=str(tmp_path)), DemoConfig(path="shipped")
+        check_inputs(cfg, ExpertConfig(), demo)
+        found, expert = obtain_demonstration(cfg, ExpertConfig(), demo)
+        assert len(found) == len(Demonstration.load(shipped_demonstrations()[name]))
+        assert expert == {"return_mean": found.card["expert"]["return_mean"]}
+    assert not any(tmp_path.iterdir())
+
+
+def test_there_is_no_other_one():
+    pong = TaskConfig(name="pong", env_id="ALE/Pong-v5")
+    with pytest.raises(UserError, match="no demonstration of pong is shipped: there are breakout"):
+        demonstration_folder("shipped", pong)
+    with pytest.raises(UserError, match="did you mean 'breakout'"):
+        demonstration_folder("shipped:breakou")
+    assert demonstration_folder("shipped_by_me", pong) == Path("shipped_by_me")
+
+
+def test_the_card_of_a_given_demonstration_may_lie(tmp_path):
+    """It was downloaded: no number but a score is taken for one."""
+    demo = Demonstration.load(shipped_demonstrations()["breakout"])
+    cfg = RunConfig(task=named_task("breakout", None))
+    for number, player in enumerate([None, [], {}, {"return_mean": "x"}, {"return_mean": None}]):
+        place = tmp_path / str(number)
+        Demonstration(demo.transitions, {**demo.card, "expert": player}).save(place)
+        given = DemoConfig(path=str(place))
+        assert obtain_demonstration(cfg, ExpertConfig(), given)[1] is None
+
+
+def test_on_the_command_line(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(["demo", "show", "shipped:breakout"]) == 0
+    assert "breakout (ALE/Breakout-v5)" in capsys.readouterr().out
+    words = ["task=breakout", "demo.path=shipped", "steps=0", "bc.steps=2", "logger=null", "out=a"]
+    assert main(["run", "bc", *words, "eval.episodes=1", "task.max_episode_steps=30"]) == 0
+    result = json.loads((tmp_path / "a" / "result.json").read_text())
+    card = Demonstration.load(shipped_demonstrations()["breakout"]).card
+    assert result["expert_return_mean"] == card["expert"]["return_mean"]
+    assert result["seeds"]["demo"] == card["seed"]
+    assert [path.name for path in tmp_path.iterdir()] == ["a"]
+    assert main(["run", "bc", "task=inverted_pendulum", "demo.path=shipped", "out=b"]) == 2
+    assert "no demonstration of inverted_pendulum is shipped" in capsys.readouterr().err
