@@ -79,7 +79,8 @@ class PixelDecoder(nn.Module):
         """
         frames = flat_frames(observation, self.channels)
         image = self.image(code).reshape(frames.shape)
-        return self.last(torch.cat((image, frames), 1)).reshape(observation.shape)
+        joined = torch.cat((image, frames), 1).contiguous(memory_format=torch.channels_last)
+        return self.last(joined).reshape(observation.shape)
 
     def action_table(self) -> Tensor:
         """What each action adds to the prediction, bias included: ``(actions, channels, 84, 84)``.
