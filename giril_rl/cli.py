@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from giril_rl import recipes
+from giril_rl.allocator import keep_freed_memory
 from giril_rl.cli_parser import Parser as _Parser
 from giril_rl.errors import FAILED, INTERRUPTED, RunError, UserError, told
 from giril_rl.nearest import did_you_mean
@@ -92,6 +93,7 @@ def _run(argv: Sequence[str]) -> int:
         if _makes_things_below_root(config):
             check_place(Path(config.root), "root=")
         jobs[out] = job
+    keep_freed_memory()
     module = recipe.load()
 
     def run(out: Path) -> None:

@@ -1,9 +1,10 @@
 """Atari training speed with GIRIL's reward on, paired with stable-baselines3's PPO.
 
-Both train in turns in one process with the same number of torch threads: 8 games, 128 steps, 4
-epochs, minibatches of 256, the same networks (three convolutions and a layer of 512). Ours computes
-GIRIL's reward at beta = 1 and scales it besides; stable-baselines3 learns from the clipped score,
-behind its own wrappers (``make_atari_env``, ``VecFrameStack``).
+Both train in turns, each in a process of its own, with the same number of torch threads: 8 games,
+128 steps, 4 epochs, minibatches of 256, the same networks (three convolutions and a layer of 512).
+Ours computes GIRIL's reward at beta = 1 and scales it besides, as ``giril run`` does;
+stable-baselines3 learns from the clipped score, behind its own wrappers (``make_atari_env``,
+``VecFrameStack``).
 
     pip install -e ".[atari,benchmark]" opencv-python-headless
     python tests/benchmarks/atari_training.py
@@ -12,12 +13,14 @@ behind its own wrappers (``make_atari_env``, ``VecFrameStack``).
 from __future__ import annotations
 
 import argparse
+import multiprocessing
 import os
 import statistics
 import tempfile
 import time
 import warnings
 from collections.abc import Callable
+from multiprocessing.connection import Connection
 from pathlib import Path
 
 import ale_py
@@ -28,6 +31,7 @@ from stable_baselines3.common.env_util import make_atari_env
 from stable_baselines3.common.vec_env import VecFrameStack
 from torchrl.envs import Compose
 
+from giril_rl.allocator import keep_freed_memory
 from giril_rl.configs import RunConfig, TaskConfig
 from giril_rl.envs import make_env
 from giril_rl.rewards import GenerativeReward
@@ -81,6 +85,19 @@ def theirs(config: RunConfig, device: str) -> Callable[[int], None]:
     return train
 
 
+def serve(name: str, config: RunConfig, device: str, threads: int, pipe: Connection) -> None:
+    """Trains for as many steps as are sent, and sends the seconds that it took; 0 ends it."""
+    warnings.simplefilter("ignore")
+    torch.set_num_threads(threads)
+    if name == "giril_rl":
+        keep_freed_memory()  # As the command line does.
+    train = {"giril_rl": ours, "stable-baselines3": theirs}[name](config, device)
+    while steps := pipe.recv():
+        began = time.perf_counter()
+        train(steps)
+        pipe.send(time.perf_counter() - began)
+
+
 def main() -> None:
     """Print steps per second of both and the ratio, pair by pair."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
@@ -90,22 +107,21 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--batches", type=int, default=6, help="batches of 1,024 steps a round")
     args = parser.parse_args()
-    warnings.simplefilter("ignore")
-    torch.set_num_threads(args.threads)
     task = TaskConfig(name=args.game, env_id=f"ALE/{args.game}-v5")
     config = apply_task_defaults(RunConfig(task=task))
     steps = args.batches * config.ppo.num_envs * config.ppo.rollout
-    pair = {
-        "giril_rl": ours(config, args.device),
-        "stable-baselines3": theirs(config, args.device),
-    }
+    spawning = multiprocessing.get_context("spawn")
+    pair = {}
+    for name in ("giril_rl", "stable-baselines3"):
+        pair[name], theirs_end = spawning.Pipe()
+        settings = (name, config, args.device, args.threads, theirs_end)
+        spawning.Process(target=serve, args=settings, daemon=True).start()
     ratios = []
     for number in range(args.rounds + 1):
         speed = {}
-        for name, train in pair.items():
-            began = time.perf_counter()
-            train(steps if number else steps // args.batches)
-            speed[name] = steps / (time.perf_counter() - began)
+        for name, pipe in pair.items():
+            pipe.send(steps if number else steps // args.batches)
+            speed[name] = steps / pipe.recv()
         if number == 0:
             continue  # Warming up.
         ratios.append(speed["giril_rl"] / speed["stable-baselines3"])
