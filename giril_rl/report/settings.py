@@ -16,6 +16,9 @@ from giril_rl.schema import flat
 
 WITHOUT_PROFILE = frozenset({"expert", "gail", "vail", "bc", "control:random"})
 """Methods that never average rewards over environments, so that both profiles are one run."""
+_NOT_FITTED = frozenset(
+    f"control:{name}" for name in ("constant", "copy", "untrained_giril", "untrained_icm", "random")
+)
 # A control's `reward` is a part of its method's name.
 _IDENTITY = NO_EFFECT | {"recipe", "seed", "steps", "task.name", "task.steps", "profile", "reward"}
 Changes = tuple[tuple[str, str], ...]
@@ -66,11 +69,17 @@ def changes_of(runs: Sequence[RunRecord]) -> dict[str, Changes]:
             key: text_of(value)
             for key, value in run.config.items()
             if key not in _IDENTITY
+            and _reads(run, key)
             and not _averaging_follows(run, key, value)
             and not (key in base and base[key] == value)
         }
         found[run.name] = tuple(sorted(differing.items()))
     return found
+
+
+def _reads(run: RunRecord, key: str) -> bool:
+    """Whether the setting can make a difference to the run: a control may have nothing to fit."""
+    return not (key.startswith("fit.") and method_of(run) in _NOT_FITTED)
 
 
 def _averaging_follows(run: RunRecord, key: str, value: Any) -> bool:
@@ -133,7 +142,11 @@ def shared_changes(
     candidates = {change for run in runs for change in changes[run.name] if change[0] not in keep}
     found = []
     for change in sorted(candidates):
-        having = [run for run in runs if change[0] in run.config and method_of(run) != "expert"]
+        having = [
+            run
+            for run in runs
+            if change[0] in run.config and _reads(run, change[0]) and method_of(run) != "expert"
+        ]
         methods = {method_of(run) for run in having}
         if len(methods) > 1 and all(change in changes[run.name] for run in having):
             found.append(change)

@@ -151,6 +151,19 @@ def test_what_one_method_alone_has_is_not_shared(made):
     assert panel.rows[0].settings == "reward.prior=conditional"
 
 
+def test_how_a_model_is_fitted_is_nothing_to_controls_that_have_none(made):
+    for recipe in ("giril", "cdil"):
+        made(recipe, "fit.steps=7", score=1.0)
+    made("control", score=2.0)
+    made("control", "reward=copy", "fit.steps=9", score=3.0)
+    (panel,) = panels(made)
+    assert panel.shared == (("fit.steps", "7"),)
+    assert len(panel.main) == 4
+    made("control", "reward=noise", score=4.0)  # Which is matched to a fitted model.
+    (panel,) = panels(made)
+    assert panel.shared == () and len(panel.main) == 3
+
+
 def test_ablations_are_recognised_by_their_keys(made):
     made("giril", score=1.0)
     made("giril", "profile=paper", score=1.5)  # Nothing is varied in this profile.
