@@ -183,7 +183,7 @@ def _run_play(args: Namespace) -> None:
 
 
 def _found_folder(path: Path) -> Path:
-    from giril_rl.demos.shipped import demonstration_folder
+    from giril_rl.shipped import demonstration_folder
 
     folder = demonstration_folder(path)
     if not (folder / "card.json").is_file():

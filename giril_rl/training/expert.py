@@ -20,7 +20,6 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from giril_rl.configs import DemoConfig, ExpertConfig, ExpertRunConfig, RunConfig, TaskConfig
 from giril_rl.demos import Demonstration, check_demonstration, record_demonstration
-from giril_rl.demos.shipped import demonstration_folder
 from giril_rl.demos.task import as_recorded_task, spaces_of
 from giril_rl.envs import gym_factory, make_env, with_own_episodes
 from giril_rl.errors import UserError
@@ -28,6 +27,7 @@ from giril_rl.files import remove_leftovers
 from giril_rl.naming import out_folder, safe, without_added
 from giril_rl.networks.agents import Agent
 from giril_rl.randomness import check_device
+from giril_rl.shipped import demonstration_folder
 from giril_rl.task_defaults import apply_task_defaults
 from giril_rl.training.agent import load_agent, make_agent
 from giril_rl.training.finished import read_result

@@ -127,6 +127,8 @@ def main() -> None:
         ratios.append(speed["giril_rl"] / speed["stable-baselines3"])
         shown = ", ".join(f"{name} {value:,.0f} steps/s" for name, value in speed.items())
         print(f"round {number}: {shown}, ratio {ratios[-1]:.2f}", flush=True)
+    for pipe in pair.values():
+        pipe.send(0)
     print(
         f"{args.game}, {args.device}, {args.threads} threads: "
         f"ratio {statistics.median(ratios):.2f} "

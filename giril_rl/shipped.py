@@ -11,7 +11,7 @@ from giril_rl.nearest import did_you_mean
 
 SHIPPED = "shipped"
 """Stands for a path: ``shipped`` is the task's demonstration, ``shipped:NAME`` that of NAME."""
-_FOLDER = Path(__file__).parent / "data"
+_FOLDER = Path(__file__).parent / "demos" / "data"
 
 
 def shipped_demonstrations() -> dict[str, Path]:
