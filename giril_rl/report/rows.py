@@ -79,7 +79,7 @@ class Row:
     @property
     def mode_mean(self) -> float | None:
         """Mean of :attr:`modes`, None where there are none."""
-        return sum(self.modes) / len(self.modes) if self.modes else None
+        return _mean(self.modes)
 
     @property
     def trained_steps(self) -> list[int]:

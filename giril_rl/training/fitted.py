@@ -35,26 +35,21 @@ def find_demonstration(folder: Path, within: Path) -> Demonstration | None:
         UserError: if it is there and damaged, or the run's settings are not what a run writes.
     """
     config, result = read_config(folder), read_result(folder)
-    shipped = _shipped(folder, config)
-    places = [shipped] if shipped is not None else _places(folder, within, config)
-    for place in places:
-        if place == shipped or _is_inside(place / "card.json", within):
-            found = Demonstration.load(place)
-            return found if len(found) == result.get("demo_transitions") else None
-    return None
-
-
-def _shipped(folder: Path, config: dict[str, Any]) -> Path | None:
-    """The package's own demonstration, if it is what the run learned from."""
     demo = read_part(folder, config, "demo", DemoConfig)
-    if demo.path is None or not is_shipped(demo.path):
+    place: Path | None
+    if demo.path is not None and is_shipped(demo.path):
+        place = demonstration_folder(demo.path, read_part(folder, config, "task", TaskConfig))
+    else:
+        places = _places(folder, within, config, demo)
+        place = next((path for path in places if _is_inside(path / "card.json", within)), None)
+    if place is None:
         return None
-    return demonstration_folder(demo.path, read_part(folder, config, "task", TaskConfig))
+    found = Demonstration.load(place)
+    return found if len(found) == result.get("demo_transitions") else None
 
 
-def _places(folder: Path, within: Path, config: dict[str, Any]) -> Iterator[Path]:
+def _places(folder: Path, within: Path, config: dict[str, Any], demo: DemoConfig) -> Iterator[Path]:
     """Where the demonstration may lie."""
-    demo = read_part(folder, config, "demo", DemoConfig)
     if demo.path is not None:
         yield from _readings(demo.path, folder, within)
         return
