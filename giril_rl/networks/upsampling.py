@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-_ROWS = 4
+from giril_rl.networks.rows import ROWS, rows_kernel
 
 
 class ChannelsLast(nn.Unflatten):
@@ -61,10 +61,8 @@ class TransposedConv(nn.ConvTranspose2d):
 class RowsTransposedConv(TransposedConv):
     """A transposed convolution of stride 1 to a few channels, computed for four rows at once.
 
-    It is a convolution of the flipped kernel. Four output channels leave most of a CPU's vector
-    unit idle; as 16, with a stride of four rows and a kernel over all that the four rows read, they
-    fill it. On other devices, and where the output's height is no multiple of four, it is computed
-    as it is.
+    It is a convolution of the flipped kernel, see :func:`~giril_rl.networks.rows.rows_kernel`. On
+    other devices, and where the output's height is no multiple of four, it is computed as it is.
 
     Args:
         in_channels: channels of the input.
@@ -85,7 +83,7 @@ class RowsTransposedConv(TransposedConv):
         """``(n, out_channels, height + kernel_size - 1, ...)``."""
         assert self.bias is not None
         height = input.shape[-2] + self.kernel_size[0] - 1
-        if input.device.type != "cpu" or height % _ROWS:
+        if input.device.type != "cpu" or height % ROWS:
             return super().forward(input, output_size)
         return _ByRows.apply(input, self.weight) + self.bias[:, None, None]
 
@@ -96,10 +94,8 @@ class _ByRows(torch.autograd.Function):
     @staticmethod
     def forward(input: Tensor, weight: Tensor) -> Tensor:
         plain, border = weight.transpose(0, 1).flip(2, 3), weight.shape[-1] - 1
-        # Each row's kernel lies one row further down in the common one.
-        packed = torch.stack([F.pad(plain, (0, 0, r, _ROWS - 1 - r)) for r in range(_ROWS)], 1)
-        out = F.conv2d(input, packed.flatten(0, 1), stride=(_ROWS, 1), padding=border)
-        return out.unflatten(1, (-1, _ROWS)).transpose(2, 3).flatten(2, 3)
+        out = F.conv2d(input, rows_kernel(plain), stride=(ROWS, 1), padding=border)
+        return out.unflatten(1, (-1, ROWS)).transpose(2, 3).flatten(2, 3)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Tensor, ...], output: Tensor) -> None:

@@ -6,9 +6,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from giril_rl.networks.rows import ROWS, rows_kernel
+
 HALF_RANGE = 127.5
-ROWS = 4
-"""Neighbouring rows that are computed at once, as channels."""
 
 
 @torch.no_grad()
@@ -52,7 +52,10 @@ def factored_error(
     batch, frame = action.shape, table.shape[1:]
     action = action.reshape(-1).long()
     observation, following = (x.reshape(-1, *frame) for x in (observation, following))
-    table, kernel = _deal(_raw_table(table, state_weight)).flatten(1, 2), _kernel(state_weight)
+    table, kernel = (
+        _deal(_raw_table(table, state_weight)).flatten(1, 2),
+        rows_kernel(state_weight, dilation=2),
+    )
     chunk = min(chunk, max(len(action), 1))
     # Memory written again and again stays in the cache; new memory for each chunk would not.
     state, offset = (table.new_empty(chunk, *shape) for shape in (frame, table.shape[1:]))
@@ -79,19 +82,6 @@ def _raw_table(table: Tensor, weight: Tensor) -> Tensor:
     """
     ones = torch.ones_like(table[:1])
     return HALF_RANGE * (table + 1 - F.conv2d(ones, weight, padding=2, dilation=2))
-
-
-def _kernel(weight: Tensor) -> Tensor:
-    """The kernel that computes four rows at once, an output channel for each.
-
-    Four output channels leave most of a CPU's vector unit idle. As 16, with a stride of four rows
-    and a kernel over the eight that the four rows read, they fill it.
-    """
-    out, channels, height, width = weight.shape
-    packed = weight.new_zeros(out, ROWS, channels, ROWS + 2 * (height - 1), width)
-    for row in range(ROWS):
-        packed[:, row, :, row : row + 2 * height - 1 : 2] = weight
-    return packed.flatten(0, 1)
 
 
 def _deal(images: Tensor) -> Tensor:
