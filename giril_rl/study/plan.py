@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -90,10 +91,8 @@ class Planner:
         shared = [text for text in changes if not any(_has(s, text) for s in schemas)]
         for group in spec.groups:
             for word in group.recipes:
-                try:
+                with _naming(spec, group):
                     found = self._runs(group, word, changes, shared)
-                except UserError as error:
-                    raise UserError(f"{spec.name}, group {group.label!r}: {error}") from None
                 for run in found:
                     same = runs.setdefault(f"{run.recipe.name} {config_hash(run.config)}", run)
                     if same is not run:
@@ -111,10 +110,8 @@ class Planner:
     def _all_schemas(self, spec: Spec) -> list[type[Any]]:
         found = []
         for group in spec.groups:
-            try:
+            with _naming(spec, group):
                 found += [self._recipe(word)[1] for word in group.recipes]
-            except UserError as error:
-                raise UserError(f"{spec.name}, group {group.label!r}: {error}") from None
         return found
 
     def _runs(
@@ -198,6 +195,15 @@ class Planner:
             schema = self._recipe(recipe.word)[1]
             self._resolutions[known] = resolved(recipe, schema, words)
         return self._resolutions[known]
+
+
+@contextmanager
+def _naming(spec: Spec, group: Group) -> Iterator[None]:
+    """Says in a refusal which group it is about."""
+    try:
+        yield
+    except UserError as error:
+        raise UserError(f"{spec.name}, group {group.label!r}: {error}") from None
 
 
 def _differs(word: str, config: Any, base: Any) -> bool:
