@@ -39,10 +39,16 @@ class Finite:
                 raise self._error(f"{name} is {value}", step)
 
     def weights(self, module: nn.Module, step: int) -> None:
-        """Raises RunError if one of the module's parameters is not finite at ``step``."""
+        """Raises RunError if a parameter of the module is not finite, or a buffer has a NaN.
+
+        Buffers are running statistics, but also bounds of actions, which may be infinite.
+        """
         for name, parameter in module.named_parameters():
             if not torch.isfinite(parameter).all():
                 raise self._error(f"{name} has weights that are not finite", step)
+        for name, buffer in module.named_buffers():
+            if torch.isnan(buffer).any():
+                raise self._error(f"{name} has statistics that are not numbers", step)
 
     def _error(self, what: str, step: int) -> RunError:
         return RunError(

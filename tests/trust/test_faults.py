@@ -116,8 +116,15 @@ def test_a_reward_that_is_no_number(value, tmp_path):
     assert load_state(tmp_path / "ppo.safetensors")["steps"] == 256
 
 
-def test_weights_that_are_no_numbers_are_not_saved(tmp_path, monkeypatch):
-    """The last gradient step may break what all losses were computed with before."""
+@pytest.mark.parametrize(
+    ("broken", "sentence"),
+    [
+        ("actor.0.weight", r"actor\.0\.weight has weights that are not finite at 192"),
+        ("normaliser.mean", r"normaliser\.mean has statistics that are not numbers at 192"),
+    ],
+)
+def test_what_is_no_number_is_not_saved(broken, sentence, tmp_path, monkeypatch):
+    """The end of an update may break what all losses were computed with before."""
     from giril_rl.training.ppo import PPOLearner
 
     learn = PPOLearner.learn
@@ -125,11 +132,11 @@ def test_weights_that_are_no_numbers_are_not_saved(tmp_path, monkeypatch):
     def learn_and_break(self, batch, taken):
         losses = learn(self, batch, taken)
         if taken == 128:
-            self.agent.actor[0].weight.data[0, 0] = float("nan")
+            self.agent.state_dict()[broken].view(-1)[0] = float("nan")
         return losses
 
     monkeypatch.setattr(PPOLearner, "learn", learn_and_break)
-    with pytest.raises(RunError, match=r"actor\.0\.weight has weights that are not finite at 192"):
+    with pytest.raises(RunError, match=sentence):
         trained(tmp_path, Breaks(1.0))
     assert load_state(tmp_path / "ppo.safetensors")["steps"] == 128
 
