@@ -1,6 +1,7 @@
 """Every run of a study is composed and checked before the first one starts."""
 
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -225,8 +226,24 @@ def test_shipped_studies_hold_what_they_say():
     # 3 experts, the true reward; on 3 tasks with 3 seeds as above, and both forms of 2 methods.
     assert counts["pybullet-no-survival"] == 3 + 3 * 3 + 3 * 3 * (2 * 2 + 2 * 2 + 1 + 8)
     assert counts["atari-smoke"] == 6 * (1 + 5 + 5)
+    # A fit of the recipe's own length would take hours on frames.
+    fitted = [run for run in plans["atari-smoke"] if hasattr(run.config, "fit")]
+    rewards = ("noise", "negated_giril", "centred_giril")
+    fits = [
+        run.config.fit.steps
+        for run in fitted
+        if run.recipe.word != "control" or run.config.reward in rewards
+    ]
+    assert fits == [10] * 6 * 3
     # 2 experts; on 2 games with 2 seeds: GIRIL in 2 profiles, CDIL, 2 adversarial, BC, 6 controls.
     assert counts["atari-small"] == 2 + 2 * 2 * (2 + 1 + 2 + 1 + 6)
+    pages = Path(__file__).parents[2] / "docs"
+    for name, count in counts.items():
+        row = rf"^\| `{name}` \|.*"
+        (one,) = re.findall(row, (pages / "studies.md").read_text(), re.MULTILINE)
+        assert one.endswith(f": {count} runs |"), one
+        (one,) = re.findall(row, (pages / "reproduce.md").read_text(), re.MULTILINE)
+        assert one.split("|")[2].strip() == str(count), one
     names = {run.name for run in plans["pybullet"]}
     same = planner.plan(read_spec(find_study("pybullet-ablations")), ["steps=1000000"])
     # At one budget own settings and controls are run once for both studies.
