@@ -1,6 +1,8 @@
 """A Gymnasium environment small enough to know by heart, and signals as tests expect them."""
 
 import signal
+import sys
+from pathlib import Path
 
 import gymnasium
 import numpy as np
@@ -8,6 +10,8 @@ import pytest
 import torch
 from gymnasium import spaces
 
+# Test files are imported one by one; this lets them share the modules beside this one.
+sys.path.insert(0, str(Path(__file__).parent))
 torch.set_num_threads(1)  # As the command line does; the default is slower for small networks.
 
 

@@ -9,12 +9,12 @@ nothing; what else ``giril`` does is done. A block that cannot run says why in t
 import re
 import shlex
 import subprocess
-import sys
 import tomllib
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
+import pages
 import pytest
 import yaml
 
@@ -22,9 +22,6 @@ from giril_rl.cli import main
 from giril_rl.recipe_config import config_class
 from giril_rl.recipes import Recipe
 from giril_rl.study.spec import Spec, read_spec
-
-sys.path.insert(0, str(Path(__file__).parent))
-import pages
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from tensordict import TensorDictBase
-from torch import nn
+from torch import Tensor, nn
 from torchrl.collectors import Collector
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
@@ -158,7 +158,8 @@ def train_ppo(
                 stopped = sum(recent) / len(recent) >= stop_at
             if taken >= next_save or taken >= steps or stopped or interrupt.requested:
                 next_save += cfg.checkpoint_every
-                finite.weights(parts, taken)
+                for part in (agent, relabel):  # Not the tracker: the true reward may be anything.
+                    finite.weights(part, taken)
                 state = {
                     "steps": taken,
                     "seconds": time.perf_counter() - began,
@@ -261,7 +262,7 @@ class PPOLearner:
             self.advantage(batch)
         flat = [batch.get(key).flatten(0, 1) for key in self.keys]
         for _ in range(cfg.epochs):
-            logs: list[dict[str, torch.Tensor]] = []
+            logs: list[dict[str, Tensor]] = []
             order = torch.randperm(batch.numel()).to(self.agent.device)
             for minibatch in zip(*(x[order].split(cfg.minibatch) for x in flat), strict=True):
                 logs.append(self.gradients.step(minibatch))
@@ -271,11 +272,21 @@ class PPOLearner:
 
 
 class RecordableClipPPOLoss(ClipPPOLoss):
-    """:class:`torchrl.objectives.ClipPPOLoss` for distributions that know their entropy.
+    """:class:`torchrl.objectives.ClipPPOLoss` that looks at no tensor's value on its way.
 
     TorchRL looks whether the entropy is finite and estimates it from samples where it is not, which
-    a recorded graph cannot decide anew at each call.
+    a recorded graph cannot decide anew at each call; these distributions know their entropy. And it
+    asks the tensor ``clip_value`` whether it is zero, for which a GPU would be waited for.
     """
 
-    def _get_entropy(self, dist: Any, adv_shape: torch.Size) -> torch.Tensor:
+    clip_value: float | None
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        if "clip_value" in self._buffers:
+            bound = self.get_buffer("clip_value").item()
+            del self.clip_value
+            self.clip_value = bound
+
+    def _get_entropy(self, dist: Any, adv_shape: torch.Size) -> Tensor:
         return dist.entropy().unsqueeze(-1)

@@ -9,6 +9,8 @@ import torch
 from torch import Tensor
 from torch.fx.experimental.proxy_tensor import make_fx
 
+from giril_rl.randomness import restore_rng, rng_state
+
 
 def record(
     function: Callable[..., tuple[Tensor, ...]], inputs: Sequence[Tensor]
@@ -31,12 +33,12 @@ def record(
         >>> double(torch.tensor([1.0, 3.0]))
         (tensor([2., 6.]),)
     """
-    state = torch.get_rng_state()
+    state = rng_state(inputs[0].device)
     with torch.no_grad(), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # The recorded graph holds nothing that tracing warns of.
         graph = make_fx(function)(*inputs)
         graph.graph.eliminate_dead_code()
         graph.recompile()
         recorded = torch.jit.trace(graph, tuple(inputs), check_trace=False)
-    torch.set_rng_state(state)  # Recording must not consume the run's random numbers.
+    restore_rng(state)  # Recording must not consume the run's random numbers.
     return recorded

@@ -31,7 +31,7 @@ def discounted_filter(
         return reward, carry
     size = min(BLOCK, steps)
     index = torch.arange(size + 1, device=reward.device)
-    powers = torch.as_tensor(gamma, dtype=reward.dtype, device=reward.device) ** index
+    powers = torch.full((), gamma, dtype=reward.dtype, device=reward.device) ** index
     # weights[j, i] = gamma^(i - j): what the reward of step j is worth at step i of its block.
     weights = powers[(index[:-1] - index[:-1, None]).clamp_min(0)].triu()
     blocks = []
@@ -51,7 +51,7 @@ def _forget(filtered: Tensor, done: Tensor, gamma: float) -> tuple[Tensor, Tenso
     time = torch.arange(filtered.shape[1], device=filtered.device)
     ends = torch.where(done, time, -1).cummax(1).values
     last_end = torch.cat((torch.full_like(ends[:, :1], -1), ends[:, :-1]), 1)
-    base = torch.as_tensor(gamma, dtype=filtered.dtype, device=filtered.device)
+    base = torch.full((), gamma, dtype=filtered.dtype, device=filtered.device)
     old = base ** (time - last_end) * filtered.gather(1, last_end.clamp_min(0))
     forgetful = filtered - torch.where(last_end >= 0, old, 0.0)
     return forgetful, torch.where(done[:, -1], 0.0, forgetful[:, -1])

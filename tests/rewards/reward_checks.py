@@ -20,6 +20,7 @@ from reward_cases import (
     transitions,
 )
 from reward_worlds import MakeEnv, world_of
+from second_device import DEVICE, second_device
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import TransformedEnv
 
@@ -129,6 +130,14 @@ def check_state_round_trip(case: Case, folder) -> None:
     assert torch.equal(rewards(other, batch), expected)
     if case.learned:
         assert not torch.equal(rewards(build(case, seed=2), batch), expected)
+
+
+def check_another_device(case: Case) -> None:
+    """Where its weights are, it takes a batch and answers, and waits for no value on the way."""
+    module, batch = build(case).eval(), transitions(case, 2, 3)
+    with second_device() as device, torch.no_grad():
+        device.take(module)
+        assert module(device.batch(batch)).get(PLAIN["reward"]).device == DEVICE
 
 
 def check_nested_keys(case: Case) -> None:

@@ -8,6 +8,7 @@ import reward_checks as checks
 import torch
 from reward_cases import CASES, Setting, register
 from tensordict.nn import TensorDictModule
+from torch._subclasses.fake_tensor import DataDependentOutputException
 
 from giril_rl.rewards import (
     AffineReward,
@@ -137,6 +138,11 @@ def test_state_round_trip(case, tmp_path):
 
 
 @every_reward
+def test_another_device(case):
+    checks.check_another_device(case)
+
+
+@every_reward
 def test_nested_keys(case):
     checks.check_nested_keys(case)
 
@@ -161,6 +167,14 @@ def reward_of(function):
 def batch_mean(s, a, following):
     error = (s - following).square().sum(-1, keepdim=True)
     return error.mean().expand_as(error)
+
+
+def with_a_look(s, a, following):
+    return (s - following).sum(-1, keepdim=True) * (1.0 if s.abs().max() > 1 else 2.0)
+
+
+def with_a_constant(s, a, following):
+    return (s - following).sum(-1, keepdim=True) * torch.ones(1)
 
 
 class Drifting(CopyReward):
@@ -190,6 +204,8 @@ WRONG = {
         lambda c: GlobalNoise(1.0, 1.0, out_keys=c.out_keys),
         "evaluation_leaves_no_trace",
     ),
+    "looks at a value": (reward_of(with_a_look), "another_device"),
+    "keeps a tensor": (reward_of(with_a_constant), "another_device"),
 }
 
 
@@ -197,5 +213,6 @@ WRONG = {
 def test_a_wrong_reward_is_caught(name):
     build, check = WRONG[name]
     case = checks.Case(name, build, False, checks.ENTRIES, deterministic=True, learned=True)
-    with pytest.raises(AssertionError):
+    errors = (AssertionError, DataDependentOutputException, RuntimeError)
+    with pytest.raises(errors if check == "another_device" else AssertionError):
         getattr(checks, f"check_{check}")(case)
