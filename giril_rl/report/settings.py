@@ -14,7 +14,9 @@ from giril_rl.naming import NO_EFFECT
 from giril_rl.report.runs import RunRecord
 from giril_rl.schema import flat
 
-WITHOUT_PROFILE = frozenset({"expert", "gail", "vail", "bc", "control:random"})
+TRUE_REWARD = "true_reward"
+"""A run of the recipe ``expert`` that takes its whole budget, as the methods beside it do."""
+WITHOUT_PROFILE = frozenset({"expert", TRUE_REWARD, "gail", "vail", "bc", "control:random"})
 """Methods that never average rewards over environments, so that both profiles are one run."""
 _NOT_FITTED = frozenset(
     f"control:{name}" for name in ("constant", "copy", "untrained_giril", "untrained_icm", "random")
@@ -78,8 +80,14 @@ def changes_of(runs: Sequence[RunRecord]) -> dict[str, Changes]:
 
 
 def _reads(run: RunRecord, key: str) -> bool:
-    """Whether the setting can make a difference to the run: a control may have nothing to fit."""
-    return not (key.startswith("fit.") and method_of(run) in _NOT_FITTED)
+    """Whether a setting tells the run from others of its method.
+
+    A control may have nothing to fit, and what stops early is called otherwise.
+    """
+    method = method_of(run)
+    if key == "stop_early":
+        return method != TRUE_REWARD
+    return not (key.startswith("fit.") and method in _NOT_FITTED)
 
 
 def _averaging_follows(run: RunRecord, key: str, value: Any) -> bool:
@@ -95,8 +103,10 @@ def uses_profile(run: RunRecord) -> bool:
 
 
 def method_of(run: RunRecord) -> str:
-    """The method's name: the result's, else the recipe's."""
-    return str((run.result or {}).get("method", run.recipe))
+    """The method's name: the result's, else the recipe's; an expert may be one to compare with."""
+    method = str((run.result or {}).get("method", run.recipe))
+    whole = method == "expert" and run.config.get("stop_early") is False
+    return TRUE_REWARD if whole else method
 
 
 def _usual(runs: Iterable[RunRecord]) -> dict[tuple[str, str], dict[str, Any]]:

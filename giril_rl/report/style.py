@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 NAMES = {
     "expert": "expert",
+    "true_reward": "PPO on the true reward",
     "giril": "GIRIL",
     "cdil": "CDIL",
     "gail": "GAIL",
@@ -20,6 +21,7 @@ SKY, RED, GREY = "#56B4E9", "#D55E00", "#8C8C8C"
 PALETTE = (BLUE, RED, GREEN, PINK, ORANGE, SKY, BLACK, GREY)
 EXPERT, DEMONSTRATION = BLACK, GREY
 _COLOURS = {
+    "true_reward": SKY,
     "giril": BLUE,
     "cdil": RED,
     "gail": GREEN,

@@ -2,6 +2,7 @@
 
 import yaml
 
+from giril_rl.report.formats import seeds_text
 from giril_rl.report.rows import panels_of
 from giril_rl.report.runs import read_runs
 from giril_rl.report.tables import tables_of
@@ -141,6 +142,24 @@ def test_what_all_runs_share_is_the_panels_and_no_rows(made):
         ("GIRIL (released)", "reward.beta=0.9"),
         ("control: constant", ""),
     ]
+
+
+def test_a_whole_budget_on_the_true_reward_is_a_method_beside_the_others(made):
+    made("expert", score=4.0)
+    for seed in (0, 1):
+        made("expert", "stop_early=false", f"seed={seed}", score=3.0 + seed)
+    made("giril", score=1.0)
+    made("control", score=2.0)
+    (panel,) = panels(made)
+    assert [(row.name, row.settings, row.seeds) for row in panel.rows] == [
+        ("expert", "", [0]),
+        ("PPO on the true reward", "", [0, 1]),
+        ("GIRIL (released)", "", [0]),
+        ("control: constant", "", [0]),
+    ]
+    (table,) = tables_of(panel)
+    assert table.name == "results"
+    assert seeds_text(panel.main) == "1 to 2 seeds"
 
 
 def test_what_one_method_alone_has_is_not_shared(made):
