@@ -134,6 +134,7 @@ OF = {
     "docs/reproduce.md": (study_of("games.yaml"), nothing),
     "docs/results/pybullet.md": (runs, nothing),
     "docs/results/atari.md": (runs, nothing),
+    "docs/results/no-survival.md": (runs, nothing),
     "docs/sharing.md": (sharing, nothing),
     "docs/studies.md": (study_of("my_study.yaml"), nothing),
     "docs/reuse.md": (nothing, reuse_after),
