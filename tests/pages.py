@@ -135,6 +135,7 @@ OF = {
     "docs/results/pybullet.md": (runs, nothing),
     "docs/results/atari.md": (runs, nothing),
     "docs/results/no-survival.md": (runs, nothing),
+    "docs/results/ablations.md": (runs, nothing),
     "docs/sharing.md": (sharing, nothing),
     "docs/studies.md": (study_of("my_study.yaml"), nothing),
     "docs/reuse.md": (nothing, reuse_after),
