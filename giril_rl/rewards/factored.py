@@ -52,10 +52,8 @@ def factored_error(
     batch, frame = action.shape, table.shape[1:]
     action = action.reshape(-1).long()
     observation, following = (x.reshape(-1, *frame) for x in (observation, following))
-    table, kernel = (
-        _deal(_raw_table(table, state_weight)).flatten(1, 2),
-        rows_kernel(state_weight, dilation=2),
-    )
+    table = _deal(_raw_table(table, state_weight)).flatten(1, 2)
+    kernel = rows_kernel(state_weight, dilation=2)
     chunk = min(chunk, max(len(action), 1))
     # Memory written again and again stays in the cache; new memory for each chunk would not.
     state, offset = (table.new_empty(chunk, *shape) for shape in (frame, table.shape[1:]))

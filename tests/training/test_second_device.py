@@ -64,6 +64,10 @@ def made(cls, kind, **kwargs):
     return reward
 
 
+def agent_for(kind):
+    return PixelActorCritic(4) if kind == "pixels" else ActorCritic(3, ACTIONS[kind], hidden=(8,))
+
+
 class Eager(TracedGradients):
     """Not recorded, for tensors without values cannot be."""
 
@@ -126,7 +130,7 @@ def test_training_a_discriminator(cls, loss, penalty, kind):
 
 
 def test_a_step_of_ppo(kind):
-    agent = PixelActorCritic(4) if kind == "pixels" else ActorCritic(3, ACTIONS[kind], hidden=(8,))
+    agent = agent_for(kind)
     learner = PPOLearner(agent, PPOConfig(clip_value=True, entropy_coef=0.01), total_steps=8)
     rows = {"action": transitions(kind, 8)["action"], agent.input_keys[0]: torch.randn(8, 3)}
     if kind == "pixels":
@@ -146,8 +150,7 @@ def test_acting_relabelling_and_learning(kind, termination, monkeypatch):
     """A batch as :func:`giril_rl.training.train_ppo` goes through it."""
     # TorchRL asks once a batch whether an observation is NaN, and would copy it.
     monkeypatch.setattr(GAE, "_sanitize_next_obs_nan", staticmethod(lambda data, in_keys: data))
-    spec = ACTIONS[kind]
-    agent = PixelActorCritic(4) if kind == "pixels" else ActorCritic(3, spec, hidden=(8,))
+    agent = agent_for(kind)
     reward = made(GenerativeReward, kind).eval()
     relabel = Compose(IntrinsicReward(reward), BatchMeanReward(), ReturnScaling())
     cfg = PPOConfig(num_envs=ENVS, rollout=TIME, minibatch=8, epochs=2, clip_value=True)
