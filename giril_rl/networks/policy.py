@@ -69,6 +69,18 @@ class ActorCritic(Pretrained, nn.Module):
             return CategoricalActions(out)
         return DiagonalGaussian(out, self.log_std)
 
+    def act(self, observation: Tensor, *, greedy: bool = False) -> tuple[Tensor, Tensor, Tensor]:
+        """An action, its log-probability and the normalised observation, ``(*batch, ...)`` each.
+
+        Args:
+            observation: raw observations ``(*batch, observation_size)``, where the weights are.
+            greedy: takes the most likely action rather than a draw.
+        """
+        normalised = self.normaliser(observation)
+        distribution = self.distribution(normalised)
+        action = distribution.mode if greedy else distribution.sample()
+        return action, distribution.log_prob(action), normalised
+
     def update_normaliser(self, observation: Tensor) -> None:
         """Merges raw observations into the running statistics, if there are any."""
         if isinstance(self.normaliser, RunningNormaliser):
@@ -123,13 +135,11 @@ class ActingPolicy(TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the action for ``"observation"`` of any leading shape."""
         seen = tensordict.get("observation")
-        normalised = self.agent.normaliser(seen.to(self.agent.device))
-        distribution = self.agent.distribution(normalised)
         greedy = exploration_type() == ExplorationType.DETERMINISTIC
-        action = distribution.mode if greedy else distribution.sample()
-        tensordict.set("action", action.to(seen.device))
-        tensordict.set("action_log_prob", distribution.log_prob(action).to(seen.device))
-        return tensordict.set(NORMALISED, normalised.to(seen.device))
+        out = self.agent.act(seen.to(self.agent.device), greedy=greedy)
+        for key, value in zip(self.out_keys, out, strict=True):
+            tensordict.set(key, value.to(seen.device))
+        return tensordict
 
 
 class LossActor(TensorDictModuleBase):

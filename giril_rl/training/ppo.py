@@ -20,6 +20,7 @@ from giril_rl.errors import UserError
 from giril_rl.networks.agents import Agent
 from giril_rl.progress import progress
 from giril_rl.randomness import restore_rng, rng_state
+from giril_rl.training.acting import collecting
 from giril_rl.training.episodes import EpisodeTracker
 from giril_rl.training.finite import Finite
 from giril_rl.training.interrupt import Interrupt, Interrupted
@@ -104,7 +105,7 @@ def train_ppo(
     batch_size = cfg.num_envs * cfg.rollout
     collector = Collector(
         env,
-        agent.acting(),
+        collecting(agent),
         frames_per_batch=batch_size,
         total_frames=steps - taken,
         track_traj_ids=False,
