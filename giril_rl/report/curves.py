@@ -103,6 +103,8 @@ def draw_results(table: Table, path: Path) -> bool:
 def draw_varied(table: Table, path: Path) -> bool:
     """Write an ablation's picture: a part for each method, a line for each value.
 
+    A value has one colour in all parts.
+
     Args:
         table: the ablation's table.
         path: the PNG file.
@@ -110,14 +112,10 @@ def draw_varied(table: Table, path: Path) -> bool:
     Returns:
         Whether there was a curve to draw.
     """
-    names = list(dict.fromkeys(line.row.name for line in table.lines))
     parts = []
-    for name in names:
+    looks: dict[str, Look] = {}
+    for name in dict.fromkeys(line.row.name for line in table.lines):
         lines = [line for line in table.lines if line.row.name == name]
-        styles = [
-            Look(PALETTE[i % len(PALETTE)], "-" if i < len(PALETTE) else "--")
-            for i in range(len(lines))
-        ]
         values = [line.value for line in lines]
         labels = [
             f"{line.value}, {line.row.steps:,} steps"
@@ -125,7 +123,10 @@ def draw_varied(table: Table, path: Path) -> bool:
             else line.value
             for line in lines
         ]
-        parts.append((name, [line.row for line in lines], labels, styles))
+        for label in labels:
+            color = PALETTE[len(looks) % len(PALETTE)]
+            looks.setdefault(label, Look(color, "-" if len(looks) < len(PALETTE) else "--"))
+        parts.append((name, [line.row for line in lines], labels, [looks[x] for x in labels]))
     return _draw(table.panel, parts, [line.row for line in table.lines], path, about=table.title)
 
 

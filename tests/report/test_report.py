@@ -214,6 +214,26 @@ def test_no_curve_is_cut_off(made, drawn, tmp_path):
     ]
 
 
+def test_a_value_has_one_colour_in_all_parts_of_a_picture(made, drawn, tmp_path):
+    for recipe in ("giril", "gail", "bc"):
+        for episodes in (1, 5):
+            made(recipe, f"demo.episodes={episodes}", "demo.length=null", score=1.0)
+    made("giril", score=1.0)  # A value that one part alone has.
+    assert main(["report", str(made.root), "--out", str(tmp_path / "out")]) == 0
+    colours = {}
+    for axes in drawn[-1].axes:
+        for line in axes.get_lines():
+            label = line.get_label().partition(", n = ")[0]
+            if "full episode" in label:
+                colours.setdefault(label, []).append(line.get_color())
+    assert {label: len(found) for label, found in colours.items()} == {
+        "1 full episode": 3,
+        "5 full episodes": 3,
+    }
+    assert all(len(set(found)) == 1 for found in colours.values())
+    assert len({found[0] for found in colours.values()}) == 2
+
+
 def test_games_have_life_length_and_speed(made, capsys):
     for seed, length in ((0, 50.0), (1, 70.0)):
         made(
