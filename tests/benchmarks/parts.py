@@ -10,6 +10,7 @@ import statistics
 import time
 import warnings
 from collections.abc import Callable
+from functools import partial
 
 import torch
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
@@ -24,6 +25,7 @@ from giril_rl.configs import TaskConfig
 from giril_rl.envs import gym_factory, make_env
 from giril_rl.networks.distributions import DiagonalGaussian
 from giril_rl.networks.policy import NORMALISED, ActorCritic
+from giril_rl.training.acting import RecordedActing
 from giril_rl.training.ppo import LEARNER_KEYS
 from giril_rl.training.traced import TracedGradients
 
@@ -133,6 +135,17 @@ def distributions() -> dict[str, Callable[[], object]]:
     return {"DiagonalGaussian": ours, "IndependentNormal": theirs}
 
 
+def acting() -> dict[str, Callable[[], object]]:
+    """Act on the observations of 16 environments."""
+    agent = ActorCritic(5, Bounded(-1.0, 1.0, shape=(16, 1)))
+    seen = torch.randn(16, 5)
+    policies = {"RecordedActing": RecordedActing(agent), "ActingPolicy": agent.acting()}
+    return {
+        name: partial(lambda policy: policy(TensorDict({"observation": seen}, [16])), policy)
+        for name, policy in policies.items()
+    }
+
+
 def main() -> None:
     """Print all comparisons."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
@@ -142,6 +155,7 @@ def main() -> None:
     torch.set_num_threads(1)
     compare("collecting 16 x 100 steps", environments(), repeat=3, rounds=7)
     compare("loss and gradient", gradients(args.compile), repeat=200, rounds=7)
+    compare("acting in 16 environments", acting(), repeat=1000, rounds=7)
     compare("sample and log-probability", distributions(), repeat=1000, rounds=7)
 
 
