@@ -10,7 +10,6 @@ import statistics
 import time
 import warnings
 from collections.abc import Callable
-from functools import partial
 
 import torch
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
@@ -139,10 +138,10 @@ def acting() -> dict[str, Callable[[], object]]:
     """Act on the observations of 16 environments."""
     agent = ActorCritic(5, Bounded(-1.0, 1.0, shape=(16, 1)))
     seen = torch.randn(16, 5)
-    policies = {"RecordedActing": RecordedActing(agent), "ActingPolicy": agent.acting()}
+    recorded, plain = RecordedActing(agent), agent.acting()
     return {
-        name: partial(lambda policy: policy(TensorDict({"observation": seen}, [16])), policy)
-        for name, policy in policies.items()
+        "RecordedActing": lambda: recorded(TensorDict({"observation": seen}, [16])),
+        "ActingPolicy": lambda: plain(TensorDict({"observation": seen}, [16])),
     }
 
 
