@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import count
 from typing import Any
 
 import gymnasium
@@ -13,6 +14,7 @@ from torch import Tensor
 
 from giril_rl.demos.check import check_demonstration
 from giril_rl.demos.demonstration import Demonstration
+from giril_rl.demos.distinct import DistinctEpisodes
 from giril_rl.demos.replay import as_executed, as_recorded, verify_by_replay
 from giril_rl.envs.stdout import silent_stdout
 from giril_rl.errors import UserError
@@ -48,9 +50,10 @@ def record_demonstration(
 ) -> Demonstration:
     """Record transitions as they were, then prove them by check and by replay.
 
-    Every episode has a seed of its own, so a deterministic policy does not play the same episode
-    twice. Actions are stored as executed: clipped to the bounds of a Box. Torch's generator
-    is seeded for the recording and put back, so a sampled policy repeats as well.
+    Every episode has a seed of its own. Where another seed makes no other episode, as for a
+    deterministic policy in a game that has few beginnings, of whole episodes only those are kept
+    that repeat none before. Actions are stored as executed: clipped to the bounds of a Box.
+    Torch's generator is seeded for the recording and put back, so a sampled policy repeats as well.
 
     Args:
         make_fn: makes the Gymnasium environment: flat observation or uint8 images [c, h, w], Box
@@ -60,7 +63,7 @@ def record_demonstration(
             sample.
         seed: root of the episodes' seeds.
         length: number of transitions; the last episode is cut where it is reached.
-        episodes: number of whole episodes, instead of ``length``.
+        episodes: number of whole episodes, instead of ``length``, no two of them the same.
         deterministic: how ``policy`` chooses, for the card.
         task: the task's name, for the card.
         expert: score and source of the policy, for the card; plain JSON values.
@@ -70,7 +73,8 @@ def record_demonstration(
     Returns:
         The demonstration; its card has ``task``, ``env_id``, ``seed``, ``seeds``, ``length``,
         ``deterministic``, ``expert``, ``versions``, ``transitions`` and ``episode_returns``, a
-        game's also ``lives`` and ``actions``, their names.
+        game's also ``lives``, ``lives_left`` (at each episode's beginning and end) and ``actions``,
+        their names.
 
     Raises:
         UserError: unless exactly one of ``length`` and ``episodes`` is positive; for an action that
@@ -92,6 +96,8 @@ def record_demonstration(
     env = make_fn()
     rows: list[dict[str, Any]] = []
     seeds: list[int] = []
+    lives_left: list[list[int]] = []
+    distinct, numbers = DistinctEpisodes(episodes or 0), count()
     total, unit = (length, "steps") if length is not None else (episodes, "episodes")
     try:
         with (
@@ -100,14 +106,18 @@ def record_demonstration(
             progress(total or 0, desc="demonstration", unit=unit) as bar,
         ):
             while len(rows) < length if length is not None else len(seeds) < (episodes or 0):
-                seeds.append(episode_seed(seed, len(seeds)))
+                own = episode_seed(seed, next(numbers))
                 most = _LONGEST_EPISODE if length is None else length - len(rows)
-                played = _play(env, policy, seeds[-1], most)
+                played, counted = _play(env, policy, own, most)
                 if length is None and not played[-1]["done"]:
                     raise UserError(
                         f"an episode did not end within {most:,} steps: give the task a "
                         "max_episode_steps, or set demo.length."
                     )
+                if length is None and not distinct.add(played):
+                    continue
+                seeds.append(own)
+                lives_left.append(counted)
                 rows += [{"episode": len(seeds) - 1, "step": i, **r} for i, r in enumerate(played)]
                 bar.update(1 if length is None else len(played))
     finally:
@@ -127,6 +137,8 @@ def record_demonstration(
     }
     if lives is not None:
         demo.card["lives"] = lives
+    if all(lives_left):
+        demo.card["lives_left"] = lives_left
     meanings = getattr(env.unwrapped, "get_action_meanings", None)  # As ale-py calls it.
     if meanings is not None:
         demo.card["actions"] = list(meanings())
@@ -137,15 +149,16 @@ def record_demonstration(
 
 def _play(
     env: gymnasium.Env, policy: Callable[[Tensor], Tensor], seed: int, most: int
-) -> list[dict[str, Any]]:
-    """One episode from ``seed``, or its first ``most`` transitions."""
+) -> tuple[list[dict[str, Any]], list[int]]:
+    """One episode from ``seed``, or its first ``most`` transitions, and lives before and after."""
     rows: list[dict[str, Any]] = []
     with silent_stdout():  # the simulator connects here
-        observation, _ = env.reset(seed=seed)
+        observation, info = env.reset(seed=seed)
+    lives = [info.get("lives")]
     before = as_recorded(observation)
     while len(rows) < most:
         action = _choose(policy, before, env.action_space)
-        observation, reward, terminated, truncated, _ = env.step(
+        observation, reward, terminated, truncated, info = env.step(
             as_executed(action, env.action_space)
         )
         after = as_recorded(observation)
@@ -163,7 +176,8 @@ def _play(
         before = after
         if terminated or truncated:
             break
-    return rows
+    lives.append(info.get("lives"))
+    return rows, [int(count) for count in lives if count is not None]
 
 
 def _choose(

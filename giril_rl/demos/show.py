@@ -6,7 +6,6 @@ from giril_rl.demos.demonstration import Demonstration
 
 _LIVES = {"first": ", each up to the first lost life", "all": ", each through all lives"}
 _PLAYED = {"True": "deterministic", "False": "sampled", "by hand": "by hand"}
-_ENDS = {"first": "life lost", "all": "game over"}
 
 
 def describe(demo: Demonstration) -> str:
@@ -55,7 +54,7 @@ def describe(demo: Demonstration) -> str:
         rows["replay"] = str(card.get("replay"))
     width = max(map(len, rows)) + 2
     lines = [f"{name:<{width}}{value}" for name, value in rows.items()]
-    return "\n".join([*lines, "", *_episodes(demo, _ENDS.get(lives, "terminated"))])
+    return "\n".join([*lines, "", *_episodes(demo)])
 
 
 def _numbers(count: int) -> str:
@@ -80,17 +79,44 @@ def _expert(expert: object) -> str:
     return f"return {expert['return_mean']:,.1f}, seed {expert.get('seed')}"
 
 
-def _episodes(demo: Demonstration, ended: str) -> list[str]:
+def _episodes(demo: Demonstration) -> list[str]:
     after = demo.transitions["next"]
     last = (demo.lengths.cumsum(0) - 1).tolist()
-    rows = [("episode", "length", "score", "end")]
+    lives = _lives_left(demo)
+    rows = [["episode", "length", "score", *(["lives"] if lives else []), "end"]]
     parts = zip(demo.lengths.tolist(), demo.returns.tolist(), last, strict=True)
     for number, (length, score, row) in enumerate(parts):
         if after["terminated"][row]:
-            end = ended
+            end = _ended(demo, lives[number] if lives else None)
         else:
             end = "time limit" if after["truncated"][row] else "cut"
         shown = f"{score:,.1f}" if demo.has_rewards else "unknown"
-        rows.append((str(number), f"{length:,}", shown, end))
-    first, second, third, _ = (max(map(len, column)) for column in zip(*rows, strict=True))
-    return [f"{a:>{first}}  {b:>{second}}  {c:>{third}}  {d}" for a, b, c, d in rows]
+        left = ["{} -> {}".format(*lives[number])] if lives else []
+        rows.append([str(number), f"{length:,}", shown, *left, end])
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)][:-1]
+    return [
+        "  ".join([*(f"{x:>{w}}" for x, w in zip(row[:-1], widths, strict=True)), row[-1]])
+        for row in rows
+    ]
+
+
+def _lives_left(demo: Demonstration) -> list[list[int]] | None:
+    """Lives at each episode's beginning and end, if the card has them; it may lie."""
+    found = demo.card.get("lives_left")
+    if not isinstance(found, list) or len(found) != demo.num_episodes:
+        return None
+    pairs = (
+        isinstance(pair, list) and len(pair) == 2 and all(isinstance(n, int) for n in pair)
+        for pair in found
+    )
+    return found if all(pairs) else None
+
+
+def _ended(demo: Demonstration, lives: list[int] | None) -> str:
+    """Some games have no lives, and their first is as long as the game."""
+    kind = demo.card.get("lives")
+    if kind not in ("first", "all"):
+        return "terminated"
+    if lives is not None:
+        return "life lost" if kind == "first" and lives[1] > 0 else "game over"
+    return "life lost" if kind == "first" else "game over"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -62,6 +63,26 @@ def spaces_of(task: TaskConfig) -> tuple[Sequence[int], TensorSpec]:
     shape, spec = env.observation_spec["observation"].shape[1:], env.action_spec
     env.close()
     return shape, spec
+
+
+def check_environment(demo: Demonstration, task: TaskConfig) -> None:
+    """Refuse a demonstration whose card says that it is of another environment.
+
+    All games have the same observations, and many the same actions, which are not called alike.
+    Versions of one environment pass.
+
+    Raises:
+        UserError: naming both.
+    """
+    recorded = demo.card.get("env_id")
+    if isinstance(recorded, str) and _named(recorded) != _named(task.env_id):
+        raise UserError(
+            f"the demonstration is of {recorded} and not of {task.env_id}: use one of this task."
+        )
+
+
+def _named(env_id: str) -> str:
+    return re.sub(r"-v\d+$", "", env_id)
 
 
 def check_for_task(demo: Demonstration, task: TaskConfig) -> None:

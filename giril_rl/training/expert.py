@@ -20,7 +20,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from giril_rl.configs import DemoConfig, ExpertConfig, ExpertRunConfig, RunConfig, TaskConfig
 from giril_rl.demos import Demonstration, check_demonstration, record_demonstration
-from giril_rl.demos.task import as_recorded_task, spaces_of
+from giril_rl.demos.task import as_recorded_task, check_environment, spaces_of
 from giril_rl.envs import gym_factory, make_env, with_own_episodes
 from giril_rl.errors import UserError
 from giril_rl.files import remove_leftovers
@@ -146,6 +146,7 @@ def _given_demonstration(task: TaskConfig, path: str) -> Demonstration:
     shape, spec = spaces_of(task)
     demo = Demonstration.load(folder)
     try:
+        check_environment(demo, task)
         check_demonstration(demo, shape, spec)
     except UserError as error:
         raise UserError(f"demo.path={path} does not fit {task.name}: {error}") from None

@@ -91,8 +91,8 @@ class TracedGradients:
         with torch.no_grad():
             out = function(*self._data, *inputs)
         for parameter, gradient in zip(self.parameters, out, strict=False):
-            # A convolution's gradient may lie in memory with channels last; torch's fused Adam reads
-            # it as the parameter lies, each weight's gradient for another weight.
+            # A convolution's gradient may come with channels last; torch's fused Adam reads it as
+            # the parameter lies in memory, each weight's gradient for another weight.
             same = gradient.stride() == parameter.stride()
             parameter.grad = gradient if same else torch.empty_like(parameter).copy_(gradient)
         return dict(zip(names, out[len(self.parameters) :], strict=True))

@@ -1,5 +1,6 @@
 """Demonstrations of Atari games: one life or whole games."""
 
+import itertools
 import json
 
 import numpy as np
@@ -8,6 +9,8 @@ import torch
 
 from giril_rl.configs import TaskConfig
 from giril_rl.demos import Demonstration, record_demonstration, to_minari, verify_by_replay
+from giril_rl.demos.record import episode_seed
+from giril_rl.demos.show import describe
 from giril_rl.envs import AtariEnv, gym_factory
 from giril_rl.envs.atari_game import AtariGame
 
@@ -100,3 +103,36 @@ def test_minari_takes_the_images(breakout, tmp_path, monkeypatch):
         first.observations[-1], breakout.transitions["next", "observation"][length - 1]
     )
     assert json.loads(dataset.storage.metadata["description"])["lives"] == "first"
+
+
+def test_the_games_of_a_policy_that_repeats_itself_are_different_ones():
+    make_fn = gym_factory(task("Breakout", "life"))
+    fire = record_demonstration(make_fn, lambda o: o.new_ones(1).long(), episodes=4, seed=0)
+    starts = [0, *fire.lengths.cumsum(0).tolist()]
+    games = [fire.transitions[a:b] for a, b in itertools.pairwise(starts)]
+    for i, one in enumerate(games):
+        for other in games[:i]:
+            same = len(one) == len(other) and (
+                (one["next", "observation"] == other["next", "observation"]).all()
+            )
+            assert not same
+    # The next seed was taken where one repeated a game.
+    assert fire.card["seeds"] != [episode_seed(0, i) for i in range(4)]
+
+
+def test_lives_and_how_an_episode_ended_are_told(breakout):
+    assert breakout.card["lives_left"] == [[5, 4], [5, 4]]
+    table = describe(breakout).splitlines()[-3:]
+    assert table[0].split() == ["episode", "length", "score", "lives", "end"]
+    assert all(row.endswith("  5 -> 4  life lost") for row in table[1:])
+    whole = record("Breakout", lives="all", episodes=1)
+    assert describe(whole).endswith("  5 -> 0  game over")
+
+
+def test_a_game_without_lives_is_over_at_its_end():
+    make_fn = gym_factory(task("Pong", "life"))
+    demo = record_demonstration(
+        make_fn, lambda o: o.new_zeros(1).long(), episodes=1, seed=0, task="Pong", lives="first"
+    )
+    assert demo.card["lives_left"] == [[0, 0]]
+    assert describe(demo).endswith("  0 -> 0  game over")

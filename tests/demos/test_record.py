@@ -113,3 +113,38 @@ def test_environment_that_ignores_its_seed_is_refused():
 
     with pytest.raises(UserError, match="gives another first observation at index 0"):
         record_demonstration(Careless, lambda o: o[:, :1], length=3, seed=0)
+
+
+class Few(Counter):
+    """Another beginning for each of two kinds of seed, and no other."""
+
+    def reset(self, *, seed=None, options=None):
+        return super().reset(seed=None if seed is None else seed % 2, options=options)
+
+
+def test_whole_episodes_are_different_ones():
+    demo = record_demonstration(Few, lambda o: o[:, 1:] * 0.1, episodes=2, seed=0)
+    starts = demo.transitions["observation"][demo.transitions["step"] == 0, 0]
+    assert starts[0] != starts[1]
+    kinds = [seed % 2 for seed in demo.card["seeds"]]
+    assert sorted(kinds) == [0, 1]
+    # The first seed of each kind, and none between was kept.
+    tried = [episode_seed(0, i) for i in range(20)]
+    first = min(i for i, seed in enumerate(tried) if seed % 2 != tried[0] % 2)
+    assert demo.card["seeds"] == [tried[0], tried[first]]
+
+
+def test_more_episodes_than_there_are_are_refused_with_what_to_do():
+    sentence = "demo.episodes=3: only 2 different ones were found, the last 30 repeat them"
+    with pytest.raises(UserError, match=sentence):
+        record_demonstration(Few, lambda o: o[:, 1:] * 0.1, episodes=3, seed=0)
+
+
+def test_what_was_done_tells_episodes_apart_as_what_was_seen_does():
+    def sample(observation):
+        return torch.rand(1, 1)
+
+    demo = record_demonstration(Few, sample, episodes=4, seed=0, deterministic=False)
+    assert demo.card["seeds"] == [episode_seed(0, i) for i in range(4)]
+    # A number of transitions is what it is.
+    assert len(record_demonstration(Few, lambda o: o[:, 1:] * 0.1, length=20, seed=0)) == 20

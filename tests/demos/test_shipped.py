@@ -56,6 +56,19 @@ def test_there_is_no_other_one():
     assert demonstration_folder("shipped_by_me", pong) == Path("shipped_by_me")
 
 
+def test_another_game_is_refused_though_all_look_alike(tmp_path):
+    cfg = RunConfig(task=named_task("space_invaders", None), root=str(tmp_path))
+    sentence = "is of ALE/Breakout-v5 and not of ALE/SpaceInvaders-v5: use one of this task"
+    with pytest.raises(UserError, match=sentence):
+        check_inputs(cfg, ExpertConfig(), DemoConfig(path="shipped:breakout"))
+    # Another version is no other game, and a card that does not say so is believed.
+    demo = Demonstration.load(shipped_demonstrations()["space_invaders"])
+    for number, env_id in enumerate(["ALE/SpaceInvaders-v4", None, 3]):
+        place = tmp_path / str(number)
+        Demonstration(demo.transitions, {**demo.card, "env_id": env_id}).save(place)
+        check_inputs(cfg, ExpertConfig(), DemoConfig(path=str(place)))
+
+
 def test_the_card_of_a_given_demonstration_may_lie(tmp_path):
     """It was downloaded: no number but a score is taken for one."""
     demo = Demonstration.load(shipped_demonstrations()["breakout"])

@@ -75,6 +75,10 @@ def test_a_given_demonstration_must_fit_the_task(obtain, tmp_path):
     check_inputs(config, ExpertConfig(), given)
     demo, result = obtain_demonstration(config, ExpertConfig(), given)
     assert result == {"return_mean": demo.card["expert"]["return_mean"]} and demo.has_images
+    with pytest.raises(UserError, match=r"fit counter: the demonstration is of ALE/Breakout-v5"):
+        check_inputs(replace(config, task=COUNTER), ExpertConfig(), given)
+    Demonstration(demo.transitions, {}).save(tmp_path / "unknown")
+    given = DemoConfig(path=str(tmp_path / "unknown"))
     with pytest.raises(
         UserError,
         match=r"fit counter: the demonstration has observations of shape \[4, 84, 84\] and the "
