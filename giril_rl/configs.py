@@ -374,7 +374,8 @@ class ControlRunConfig(RunConfig):
 
     reward: str = knob(
         "constant",
-        "the reward that stands in for a learned one; random: no reward, a random policy's score",
+        "the reward that stands in for a learned one; random: no reward, a random policy's score; "
+        "held_action: no reward, the score of one action all the time, the best one",
         choices=(
             "constant",
             "untrained_giril",
@@ -384,6 +385,7 @@ class ControlRunConfig(RunConfig):
             "negated_giril",
             "centred_giril",
             "random",
+            "held_action",
         ),
     )
     expert: ExpertConfig = field(default_factory=ExpertConfig)
@@ -396,4 +398,4 @@ class ControlRunConfig(RunConfig):
     @property
     def needs_demonstration(self) -> bool:
         """Whether the control is made of a demonstration, and so of an expert."""
-        return self.reward not in ("constant", "random")
+        return self.reward not in ("constant", "random", "held_action")

@@ -1,4 +1,4 @@
-"""Control: PPO on a stand-in for a learned reward, or a random policy's score, for comparison.
+"""Control: PPO on a stand-in for a learned reward, or the score of a policy that never learned.
 
 A learned reward has shown something only where it does better than these.
 """
@@ -13,13 +13,16 @@ from torchrl.envs import Compose
 from giril_rl.configs import ControlRunConfig
 from giril_rl.envs import make_env
 from giril_rl.training import (
+    HeldAction,
     RandomPolicy,
     Run,
     Trained,
+    check_discrete,
     check_inputs,
     check_task,
     control_reward,
     finish_run,
+    held_action_scores,
     make_agent,
     obtain_demonstration,
     return_scaling,
@@ -40,10 +43,21 @@ def main(cfg: Config, out: Path) -> None:
         check_inputs(cfg, cfg.expert, cfg.demo)
     else:
         check_task(cfg)
-    player = RandomPolicy.of_task(cfg.task, cfg.seed) if cfg.reward == "random" else None
+    player: RandomPolicy | HeldAction | None = None
+    if cfg.reward == "random":
+        player = RandomPolicy.of_task(cfg.task, cfg.seed)
+    if cfg.reward == "held_action":
+        check_discrete(cfg.task)
     with Run.open(out, asdict(cfg), recipe="control", logger=cfg.logger) as run:
         if run.finished:
             return
+        if cfg.reward == "held_action":
+            # Chosen in episodes of the training's seed, scored in those of the evaluation's.
+            scores = held_action_scores(cfg.task, episodes=cfg.eval.episodes, seed=cfg.seed)
+            run.truncate_metrics("held_action", -1)
+            for action, score in enumerate(scores):
+                run.log(action, {"held_action/return_mean": score}, phase="held_action")
+            player = HeldAction.of_task(cfg.task, scores.index(max(scores)))
         if player is not None:
             finish_run(run, cfg, player, Trained(0, 0.0), method=method)
             return

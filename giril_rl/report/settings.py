@@ -16,10 +16,13 @@ from giril_rl.schema import flat
 
 TRUE_REWARD = "true_reward"
 """A run of the recipe ``expert`` that takes its whole budget, as the methods beside it do."""
-WITHOUT_PROFILE = frozenset({"expert", TRUE_REWARD, "gail", "vail", "bc", "control:random"})
+WITHOUT_PROFILE = frozenset(
+    {"expert", TRUE_REWARD, "gail", "vail", "bc", "control:random", "control:held_action"}
+)
 """Methods that never average rewards over environments, so that both profiles are one run."""
 _NOT_FITTED = frozenset(
-    f"control:{name}" for name in ("constant", "copy", "untrained_giril", "untrained_icm", "random")
+    f"control:{name}"
+    for name in ("constant", "copy", "untrained_giril", "untrained_icm", "random", "held_action")
 )
 # A control's `reward` is a part of its method's name.
 _IDENTITY = NO_EFFECT | {"recipe", "seed", "steps", "task.name", "task.steps", "profile", "reward"}

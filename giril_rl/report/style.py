@@ -35,6 +35,7 @@ _COLOURS = {
     "control:negated_giril": ORANGE,
     "control:centred_giril": SKY,
     "control:random": GREY,
+    "control:held_action": RED,
 }
 _STYLES = ("-", "--", "-.", ":")
 

@@ -7,6 +7,7 @@ from giril_rl.training.control_rewards import control_reward
 from giril_rl.training.evaluate import Scores, evaluate, evaluate_both
 from giril_rl.training.expert import check_inputs, check_task, obtain_demonstration, train_expert
 from giril_rl.training.fit import fit_reward
+from giril_rl.training.held_action import HeldAction, check_discrete, held_action_scores
 from giril_rl.training.ppo import PPOLearner, Trained, train_ppo
 from giril_rl.training.random_policy import RandomPolicy
 from giril_rl.training.result import finish_run
@@ -22,6 +23,7 @@ from giril_rl.training.scaling import return_scaling
 
 __all__ = [
     "AdversarialLearner",
+    "HeldAction",
     "PPOLearner",
     "RandomPolicy",
     "RewardLearner",
@@ -29,6 +31,7 @@ __all__ = [
     "Scores",
     "Trained",
     "bottleneck_reward",
+    "check_discrete",
     "check_inputs",
     "check_task",
     "clone_behaviour",
@@ -40,6 +43,7 @@ __all__ = [
     "finish_run",
     "fit_reward",
     "generative_reward",
+    "held_action_scores",
     "load_agent",
     "make_agent",
     "obtain_demonstration",

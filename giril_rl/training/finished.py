@@ -16,6 +16,7 @@ from giril_rl.places import check_place
 from giril_rl.schema import leaves
 from giril_rl.training.agent import load_agent
 from giril_rl.training.evaluate import Player, evaluate_both
+from giril_rl.training.held_action import HELD_ACTION, HeldAction
 from giril_rl.training.random_policy import RANDOM, RandomPolicy
 from giril_rl.training.result_file import read_result_file
 from giril_rl.untrusted import parse_yaml, read_text
@@ -109,6 +110,8 @@ def evaluate_run(folder: Path, episodes: int | None = None, seed: int | None = N
     agent: Player
     if result["method"] == RANDOM:
         agent = RandomPolicy.of_task(task, result["seed"])
+    elif result["method"] == HELD_ACTION:
+        agent = HeldAction.of_task(task, result.get("held_action"))
     else:
         agent = load_agent(folder, task)
     episodes = settings.episodes if episodes is None else episodes

@@ -16,6 +16,7 @@ from giril_rl.report.curve import write_curve
 from giril_rl.report.losses import loss_points, write_losses
 from giril_rl.training.agent import POLICY
 from giril_rl.training.evaluate import evaluate_both
+from giril_rl.training.held_action import HeldAction
 from giril_rl.training.metrics import METRICS, read_metrics
 from giril_rl.training.ppo import Trained
 from giril_rl.training.random_policy import RandomPolicy
@@ -42,7 +43,7 @@ CARD_KEYS = (
 def finish_run(
     run: Run,
     cfg: RunConfig,
-    agent: Agent | RandomPolicy,
+    agent: Agent | RandomPolicy | HeldAction,
     trained: Trained,
     *,
     method: str,
@@ -56,7 +57,8 @@ def finish_run(
     Args:
         run: the run's folder.
         cfg: the run's settings.
-        agent: the trained policy, or the random one, of which there is nothing to save.
+        agent: the trained policy; or one that was not trained, of which nothing is saved but the
+            number of the action that it holds.
         trained: its steps and seconds.
         method: the method's name in tables.
         expert: the expert's result, if there was one.
@@ -92,8 +94,10 @@ def finish_run(
         "versions": run.versions,
         "finished_at": datetime.now(UTC).isoformat(timespec="seconds"),
     }
+    if isinstance(agent, HeldAction):
+        result["held_action"] = agent.action
     card = {key: result[key] for key in CARD_KEYS}
-    if not isinstance(agent, RandomPolicy):
+    if not isinstance(agent, (RandomPolicy, HeldAction)):
         agent.save_pretrained(run.folder / POLICY, card)
     if isinstance(reward, Pretrained):
         reward.save_pretrained(run.folder / REWARD, card)

@@ -63,6 +63,7 @@ OPTIONAL: dict[str, Check] = {
     "expert_return_mean": _or_none(_number),
     "demo_return_mean": _or_none(_number),
     "demo_transitions": _or_none(_natural),
+    "held_action": _natural,
 }
 """What runs of some kind, or of an earlier version, have not."""
 

@@ -3,18 +3,21 @@
 import json
 import math
 
+import gymnasium
 import pytest
 
 from giril_rl.cli import main
-from giril_rl.envs import GymVectorEnv
+from giril_rl.configs import TaskConfig
+from giril_rl.envs import GymVectorEnv, make_env
 from giril_rl.training.checkpoint import load_state
 from giril_rl.training.metrics import read_metrics
 from giril_rl.training.run import Run
 
 REWARDS = [
     *("constant", "untrained_giril", "untrained_icm", "copy", "noise", "negated_giril"),
-    *("centred_giril", "random"),
+    *("centred_giril", "random", "held_action"),
 ]
+UNTRAINED = ("random", "held_action")
 TINY = [
     *("steps=256", "ppo.num_envs=2", "ppo.rollout=64", "ppo.minibatch=64", "ppo.epochs=1"),
     *("ppo.hidden=[16,16]", "ppo.checkpoint_every=128", "eval.episodes=2", "logger=null"),
@@ -53,6 +56,14 @@ def rows(folder):
     return [{k: v for k, v in row.items() if "seconds" not in k} for row in found]
 
 
+def starts(seed, episodes):
+    """CartPole's first states as an evaluation draws them."""
+    env = make_env(TaskConfig(name="cartpole", env_id="CartPole-v1"), episodes, seed)
+    found = env.reset()["observation"].double().tolist()
+    env.close()
+    return found
+
+
 def first_batch(folder):
     """The mean reward of the first batch, which an untrained policy played."""
     rows = [row for row in read_metrics(folder / "metrics.jsonl") if row["phase"] == "ppo"]
@@ -64,8 +75,8 @@ def test_each_control_leaves_a_whole_result(reward, root, tmp_path):
     result = run("control", tmp_path / "run", root, f"reward={reward}")
     assert result.keys() >= RESULT
     assert result["method"] == f"control:{reward}"
-    assert result["env_steps"] == (0 if reward == "random" else 256)
-    needs_demo = reward not in ("constant", "random")
+    assert result["env_steps"] == (0 if reward in UNTRAINED else 256)
+    needs_demo = reward not in ("constant", *UNTRAINED)
     assert result["demo_transitions"] == (100 if needs_demo else None)
     assert (result["expert_return_mean"] is not None) == needs_demo
     seeds = {"policy", "evaluation"} | ({"expert", "demo"} if needs_demo else set())
@@ -78,7 +89,7 @@ def test_each_control_leaves_a_whole_result(reward, root, tmp_path):
     assert again["returns"] == result["returns"]
 
 
-@pytest.mark.parametrize("reward", ["constant", "random"])
+@pytest.mark.parametrize("reward", ["constant", *UNTRAINED])
 def test_no_expert_is_made_where_none_is_needed(reward, tmp_path):
     run("control", tmp_path / "run", tmp_path / "root", f"reward={reward}")
     assert not (tmp_path / "root").exists()
@@ -95,6 +106,48 @@ def test_a_random_policy_trains_nothing_and_is_scored_on_the_same_episodes(
     assert other["returns"] != result["returns"]  # Another seed is another stream of actions.
     monkeypatch.setattr(GymVectorEnv, "_step", None)
     run("control", tmp_path / "run", root, "reward=random", "eval.episodes=3")
+
+
+def test_the_held_action_is_the_best_one_in_other_episodes_than_it_is_scored_in(root, tmp_path):
+    result = run("control", tmp_path / "run", root, "reward=held_action", "eval.episodes=20")
+    scores = []
+    for action in (0, 1):
+        env, lengths = gymnasium.make("CartPole-v1"), []
+        for start in starts(seed=0, episodes=20):
+            env.reset()
+            env.unwrapped.state, length, ended = start, 0, False
+            while not ended:
+                _, _, ended, _, _ = env.step(action)
+                length += 1
+            lengths.append(length)
+        scores.append(sum(lengths) / 20)
+    logged = [row["held_action/return_mean"] for row in rows(tmp_path / "run")]
+    assert logged == scores and scores[0] != scores[1]
+    assert result["held_action"] == scores.index(max(scores))
+    assert result["seeds"]["evaluation"] == 10_000
+    # Another seed chooses in other episodes; those that are scored are the same for all.
+    other = run("control", tmp_path / "o", root, "reward=held_action", "eval.episodes=20", "seed=1")
+    if other["held_action"] == result["held_action"]:
+        assert other["returns"] == result["returns"]
+    assert [row["held_action/return_mean"] for row in rows(tmp_path / "o")] != logged
+    assert not list((tmp_path / "run").rglob("*.safetensors"))
+
+
+def test_a_continuous_action_cannot_be_held(tmp_path, capsys):
+    words = ["task.env_id=Pendulum-v1", "reward=held_action", f"out={tmp_path / 'run'}"]
+    assert main(["run", "control", *words]) == 2
+    assert "reward=held_action needs discrete actions" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("action", [2, -1, 0.5, None, True, "0"])
+def test_a_result_with_another_action_is_refused(action, root, tmp_path, capsys):
+    run("control", tmp_path / "run", root, "reward=held_action")
+    place = tmp_path / "run" / "result.json"
+    result = json.loads(place.read_text())
+    place.write_text(json.dumps({**result, "held_action": action}))
+    assert main(["eval", str(tmp_path / "run")]) == 2
+    assert "action" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("control", "recipe"), [("giril", "giril"), ("icm", "cdil")])
@@ -160,7 +213,7 @@ def test_a_run_that_died_ends_as_an_undisturbed_one(words, root, tmp_path, monke
         (
             ["control", "reward=bogus"],
             "reward=bogus: choose one of constant, untrained_giril, untrained_icm, copy, noise, "
-            "negated_giril, centred_giril, random.",
+            "negated_giril, centred_giril, random, held_action.",
         ),
         (["control", "giril.beta=0"], "giril.beta=0.0 must be in (0, 1]."),
         (

@@ -1,0 +1,110 @@
+"""The policy that does one thing all the time: the best score that needs no look at the game."""
+
+from __future__ import annotations
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torchrl.data import TensorSpec
+
+from giril_rl.configs import TaskConfig
+from giril_rl.envs import make_env
+from giril_rl.errors import UserError
+from giril_rl.progress import progress
+from giril_rl.training.evaluate import evaluate
+
+HELD_ACTION = "control:held_action"
+"""The method's name in ``result.json``; such a run holds no policy but the action's number."""
+
+
+class HeldAction(TensorDictModuleBase):
+    """Takes one of the discrete actions, whatever it sees.
+
+    The baseline "Const" of the Arcade Learning Environment (Bellemare et al., 2013, section 4).
+
+    Args:
+        action_spec: the spec of a batched environment.
+        action: the number of the action.
+
+    Raises:
+        UserError: for actions that are not discrete, or a number that is none of them.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> from torchrl.data import Categorical
+        >>> policy = HeldAction(Categorical(4, shape=(16,)), 2)
+        >>> policy(TensorDict(batch_size=[3]))["action"]
+        tensor([2, 2, 2])
+    """
+
+    def __init__(self, action_spec: TensorSpec, action: int) -> None:
+        super().__init__()
+        count = _number_of_actions(action_spec)
+        if isinstance(action, bool) or not isinstance(action, int) or not 0 <= action < count:
+            raise UserError(f"there is no action {action!r}: actions are 0 to {count - 1}.")
+        self.in_keys: list[str] = []
+        self.out_keys = ["action"]
+        self.action = action
+
+    @classmethod
+    def of_task(cls, task: TaskConfig, action: int) -> HeldAction:
+        """The policy on a task's action space."""
+        return cls(_action_spec(task), action)
+
+    def acting(self) -> HeldAction:
+        """Itself, for it remembers nothing."""
+        return self
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes the action for each element of the batch."""
+        return tensordict.set("action", torch.full(tensordict.batch_size, self.action))
+
+
+def check_discrete(task: TaskConfig) -> None:
+    """Refuses a task that has no actions to hold, before any long work.
+
+    Raises:
+        UserError: for actions that are not discrete.
+    """
+    _number_of_actions(_action_spec(task))
+
+
+def held_action_scores(task: TaskConfig, *, episodes: int, seed: int) -> list[float]:
+    """The mean score of each action of a task when nothing else is done.
+
+    Args:
+        task: the task; whole games of it are played.
+        episodes: episodes for each action, the same ones for all.
+        seed: root of the episodes' seeds.
+
+    Examples:
+        >>> task = TaskConfig(name="cartpole", env_id="CartPole-v1")
+        >>> scores = held_action_scores(task, episodes=5, seed=0)
+        >>> len(scores), all(8 <= score <= 11 for score in scores)
+        (2, True)
+    """
+    spec = _action_spec(task)
+    scores = []
+    count = _number_of_actions(spec)
+    with progress(count, desc="held actions", unit="actions") as bar:
+        for action in range(count):
+            policy = HeldAction(spec, action)
+            played = evaluate(policy, task, episodes=episodes, seed=seed, deterministic=True)
+            scores.append(played.return_mean)
+            bar.update(1)
+    return scores
+
+
+def _action_spec(task: TaskConfig) -> TensorSpec:
+    env = make_env(task, 1, seed=0)
+    env.close()
+    return env.action_spec
+
+
+def _number_of_actions(spec: TensorSpec) -> int:
+    if spec.dtype.is_floating_point:
+        raise UserError(
+            "reward=held_action needs discrete actions, and this task's are continuous: choose "
+            "another control."
+        )
+    return int(spec.space.n)
