@@ -20,7 +20,7 @@ def factored_error(
     following: Tensor,
     *,
     clamp: bool = True,
-    chunk: int = 16,
+    chunk: int | None = None,
 ) -> Tensor:
     """``||s_hat - s'||^2`` (paper, eq. 2, beta = 1, lambda = 1), per transition, without gradient.
 
@@ -37,8 +37,8 @@ def factored_error(
         observation: s, uint8, ``(*batch, channels, height, width)``.
         following: s', likewise.
         clamp: clamp the prediction to [-1, 1], as scaled states are.
-        chunk: transitions computed at a time, few enough for what is in between to stay in a CPU's
-            cache.
+        chunk: transitions computed at a time; None takes 16 on a CPU, few enough for what is in
+            between to stay in its cache, and 1,024 elsewhere.
 
     Returns:
         The error ``(*batch,)``.
@@ -54,6 +54,8 @@ def factored_error(
     observation, following = (x.reshape(-1, *frame) for x in (observation, following))
     table = _deal(_raw_table(table, state_weight)).flatten(1, 2)
     kernel = rows_kernel(state_weight, dilation=2)
+    if chunk is None:
+        chunk = 16 if table.device.type == "cpu" else 1024
     chunk = min(chunk, max(len(action), 1))
     # Memory written again and again stays in the cache; new memory for each chunk would not.
     state, offset = (table.new_empty(chunk, *shape) for shape in (frame, table.shape[1:]))

@@ -25,7 +25,8 @@ def fit(
 
     Args:
         loss: the reward's loss; its module is trained in place and left in eval mode.
-        demonstration: transitions of any leading shape, with the loss's ``in_keys``.
+        demonstration: transitions of any leading shape, with the loss's ``in_keys``; a copy goes to
+            the loss's device.
         steps: gradient steps.
         batch: transitions in each, drawn with replacement.
         lr: Adam's step size.
@@ -58,11 +59,12 @@ def fit(
         raise UserError(
             f"{count} transitions, steps={steps} and batch={batch}: give at least one of each."
         )
-    data = demonstration.select(*loss.in_keys).reshape(-1)
+    device = next(loss.parameters()).device
+    data = demonstration.select(*loss.in_keys).reshape(-1).to(device)
     loss.reward.scaler.fit(data.get(loss.in_keys[0]))
     optimizer = torch.optim.Adam(loss.parameters(), lr=lr)
     loss.train()
-    with seeded(seed, data.get(loss.in_keys[0]).device), torch.enable_grad():
+    with seeded(seed, device), torch.enable_grad():
         for _ in range(steps):
             terms = loss(data[torch.randint(len(data), (batch,))])
             optimizer.zero_grad()

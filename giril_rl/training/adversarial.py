@@ -50,6 +50,7 @@ class AdversarialLearner:
         self._pair_keys = loss.reward.in_keys
         self.gradients = TracedGradients(loss, keys=loss.in_keys, log=loss.log_keys)
         device = self.gradients.parameters[0].device
+        loss.to(device)  # VAIL's beta as well, which is the loss's and not the reward's.
         self._expert = [expert.get(key).contiguous().to(device) for key in self._pair_keys]
         self.optimizer = torch.optim.Adam(self.gradients.parameters, lr=cfg.lr, fused=True)
         self._device = device

@@ -39,6 +39,8 @@ def record(
         graph = make_fx(function)(*inputs)
         graph.graph.eliminate_dead_code()
         graph.recompile()
-        recorded = torch.jit.trace(graph, tuple(inputs), check_trace=False)
+        # On a CPU TorchScript runs the graph as it is; for a GPU it would compile parts of it anew.
+        on_cpu = inputs[0].device.type == "cpu"
+        recorded = torch.jit.trace(graph, tuple(inputs), check_trace=False) if on_cpu else graph
     restore_rng(state)  # Recording must not consume the run's random numbers.
     return recorded

@@ -22,7 +22,8 @@ class IntrinsicReward(Transform):
     """Replaces the reward of each transition by what a reward module makes of it.
 
     The same numbers come out in an environment (step by step), on a batch (as a collector's
-    ``postproc``, by far the fastest) and in a replay buffer. The module is given only its own
+    ``postproc``, by far the fastest) and in a replay buffer. The module may be on another device
+    than the batch: what it reads is copied there, and the reward back. It is given only its own
     ``in_keys``, in eval mode and without gradient; of what it writes, only the reward is taken.
     The true reward moves to ``("next", extrinsic_key)`` and is not read. In an environment that key
     stands in the observation spec (zero at reset), because a second reward key would break code
@@ -91,6 +92,10 @@ class IntrinsicReward(Transform):
         return next_tensordict
 
     def _relabel(self, view: TensorDictBase, following: TensorDictBase) -> None:
+        weight = next(self.module.parameters(), None)
+        read = [view.get(key) for key in self.module.in_keys]
+        if weight is not None and any(x.device != weight.device for x in read):
+            view = view.to(weight.device)
         with torch.no_grad(), eval_mode(self.module):
             reward: Tensor = self.module(view).get(self._result_key).detach()
         true_reward = following.get(self.reward_key, None)

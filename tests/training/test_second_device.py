@@ -24,8 +24,10 @@ from giril_rl.rewards import (
     GenerativeRewardLoss,
     ObservationScaler,
 )
+from giril_rl.rewards.fitting import fit
 from giril_rl.training import AdversarialLearner
 from giril_rl.training.ppo import PPOLearner
+from giril_rl.training.recorded import record
 from giril_rl.training.traced import TracedGradients
 from giril_rl.transforms import BatchMeanReward, IntrinsicReward, ReturnScaling
 
@@ -172,5 +174,47 @@ def test_acting_relabelling_and_learning(kind, termination, monkeypatch):
         acted = agent.acting()(batch.apply(device.mode.from_tensor))
         assert {x.device.type for x in acted.values(True, True)} == {"cpu"}
         moved = relabel(acted.to(DEVICE))
+        moved = relabel(moved)  # What was kept from the first batch is not looked at.
         assert moved["next", "reward"].device == DEVICE
         assert "loss_critic" in learner.learn(moved, 0)
+
+
+def test_a_reward_elsewhere_than_its_batch(kind):
+    """An environment on the CPU may have a reward on a GPU."""
+    reward = made(GenerativeReward, kind).eval()
+    relabel = IntrinsicReward(reward)
+    batch = transitions(kind, ENVS, TIME)
+    batch["next", "reward"] = torch.ones(ENVS, TIME, 1)
+    with second_device(values=True) as device:
+        device.take(relabel)
+        relabelled = relabel(batch.apply(device.mode.from_tensor))
+    assert {x.device.type for x in relabelled.values(True, True)} == {"cpu"}
+    assert relabelled["next", "reward"].shape == (ENVS, TIME, 1)
+
+
+def test_all_of_vails_loss_goes_where_its_reward_is(kind):
+    reward = made(BottleneckReward, kind).to(DEVICE)
+    loss = BottleneckLoss(reward)
+    expert = transitions(kind, 20).select("observation", "action")
+    AdversarialLearner(loss, expert, AdversarialConfig(), seed=0)
+    assert loss.beta.device == DEVICE
+
+
+def test_a_demonstration_is_taken_to_the_loss_it_is_fitted_by(monkeypatch):
+    loss = GenerativeRewardLoss(made(GenerativeReward, "vectors"))
+    monkeypatch.setattr(ObservationScaler, "fit", lambda *_: None)  # It looks at values.
+    monkeypatch.setattr(torch.optim, "Adam", lambda parameters, lr: torch.optim.SGD(parameters))
+    data = transitions("vectors", 8)
+    with second_device(values=True) as device:
+        device.take(loss)
+        terms = fit(loss, data.apply(device.mode.from_tensor), steps=2, batch=4)
+    assert "loss_reconstruction" in terms
+
+
+def test_a_graph_for_another_device_is_not_compiled():
+    on_cpu, elsewhere = (
+        record(lambda x: (x + x,), [torch.ones(2, device=device)]) for device in ("cpu", DEVICE)
+    )
+    assert isinstance(on_cpu, torch.jit.ScriptFunction | torch.jit.ScriptModule)
+    assert isinstance(elsewhere, torch.fx.GraphModule)
+    assert elsewhere(torch.ones(2))[0].tolist() == [2.0, 2.0]
