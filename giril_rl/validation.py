@@ -68,6 +68,11 @@ def _check_task(key: str, task: TaskConfig) -> None:
         raise UserError(
             f"{key}.horizon={task.horizon} is for vector tasks: leave {key}.horizon=own."
         )
+    if task.episode != "life" and not task.is_atari:
+        raise UserError(
+            f"{key}.episode={task.episode} is for games, whose lives end episodes: leave "
+            f"{key}.episode=life."
+        )
     if task.after_failure != "reset" and task.horizon == "own":
         raise UserError(
             f"{key}.after_failure={task.after_failure} means nothing where a failure ends the "
@@ -111,9 +116,23 @@ def _check_normalise(config: Any) -> None:
             )
 
 
+def _check_layers(config: RunConfig) -> None:
+    """The networks of frames are the paper's: what would change those of vectors has no effect."""
+    for part in fields(config):
+        value = getattr(config, part.name)
+        for name in ("hidden", "model_hidden"):
+            if hasattr(value, name) and getattr(value, name) != getattr(type(value)(), name):
+                raise UserError(
+                    f"{part.name}.{name}={_show(getattr(value, name))} is for vectors, and "
+                    f"{config.task.name} has frames, whose layers are fixed: leave it out."
+                )
+
+
 def _check_run(config: Any) -> None:
     if isinstance(config, RunConfig):
         _check_normalise(config)
+        if config.task.is_atari:
+            _check_layers(config)
     if isinstance(config, ExpertRunConfig):
         _check_expert_run(config)
     cloning = getattr(config, "bc", None)

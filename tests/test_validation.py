@@ -271,3 +271,28 @@ def test_bounds_of_an_open_upper_end():
     validate(Part(-3.0))
     with pytest.raises(UserError, match=r"share=1\.0 must be below 1\."):
         validate(Part(1.0))
+
+
+@pytest.mark.parametrize(
+    ("part", "name"), [("ppo", "hidden"), ("reward", "hidden"), ("reward", "model_hidden")]
+)
+def test_layers_of_vectors_are_not_for_frames(part, name):
+    kind = Curious if name == "model_hidden" else Config
+    config = kind(task=TaskConfig(name="pong", env_id="ALE/Pong-v5"), steps=10_000)
+    config.reward.normalise = "pixels"
+    validate(config)
+    setattr(getattr(config, part), name, [64])
+    with pytest.raises(UserError) as refusal:
+        validate(config)
+    assert str(refusal.value) == (
+        f"{part}.{name}=[64] is for vectors, and pong has frames, whose layers are fixed: leave it "
+        "out."
+    )
+    config.task.env_id, config.reward.normalise = "Reach-v0", "raw"
+    validate(config)
+
+
+def test_only_games_have_lives():
+    config = Config(task=TaskConfig(name="reach", env_id="Reach-v0", episode="game"), steps=10_000)
+    with pytest.raises(UserError, match=r"^task\.episode=game is for games, whose lives end"):
+        validate(config)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterator
-from itertools import chain
+from itertools import chain, pairwise
 from pathlib import Path
 
 from PIL import Image
@@ -38,14 +38,17 @@ def write_gif(demo: Demonstration, path: Path, fps: int = 15) -> None:
             f"--out {path}: this demonstration's observations are vectors, of which there is no "
             "picture."
         )
-    frames = (_picture(plane) for plane in _planes(demo))
+    planes = list(_planes(demo))
+    frames = map(_picture, planes)
+    # GIF counts hundredths of a second: durations differ by one so that their sum is right.
+    ends = [round(100 * number / fps) for number in range(len(planes) + 1)]
     content = io.BytesIO()
     next(frames).save(
         content,
         format="GIF",
         save_all=True,
         append_images=frames,
-        duration=round(1000 / fps),
+        duration=[10 * (end - start) for start, end in pairwise(ends)],
         loop=0,
     )
     write_atomically(path, content.getvalue())

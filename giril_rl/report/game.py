@@ -16,6 +16,8 @@ from giril_rl.randomness import seeded
 from giril_rl.training.evaluate import Player
 
 MOST_STEPS = 2_000
+GAMES = 5
+"""Games that a typical one is chosen from."""
 
 
 @dataclass(frozen=True)
@@ -93,3 +95,18 @@ def play_game(agent: Player, task: TaskConfig, *, seed: int, most: int = MOST_ST
         actions=env.meanings,
         whole=over,
     )
+
+
+def typical_game(
+    agent: Player, task: TaskConfig, *, seed: int, most: int = MOST_STEPS
+) -> tuple[Game, int]:
+    """Of five games, with the seeds from ``seed`` on, the one of median score, and its seed.
+
+    One game alone may be one in which nothing happens. See :func:`play_game` for the rest.
+    """
+    scores = {
+        own: play_game(agent, task, seed=own, most=most).score[-1]
+        for own in range(seed, seed + GAMES)
+    }
+    median = sorted(scores, key=lambda own: scores[own])[GAMES // 2]
+    return play_game(agent, task, seed=median, most=most), median

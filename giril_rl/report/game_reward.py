@@ -74,6 +74,7 @@ def _score_and_lives(axes: Any, game: Game) -> None:
     axes.step(from_start, np.append(0.0, game.score), where="post", color=BLACK)
     low, high = min(0.0, game.score.min()), max(1.0, game.score.max())
     axes.set_ylim(low - 0.05 * (high - low), high + 0.08 * (high - low))
+    axes.yaxis.get_major_locator().set_params(integer=True)
     axes.set_ylabel("score so far")
     lives = axes.twinx()
     lives.step(from_start, np.append(game.first_lives, game.lives), where="post", color=RED)

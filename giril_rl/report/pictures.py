@@ -10,7 +10,7 @@ from giril_rl.configs import DemoConfig, is_atari
 from giril_rl.demos import Demonstration
 from giril_rl.errors import UserError
 from giril_rl.naming import safe
-from giril_rl.report.game import MOST_STEPS, play_game
+from giril_rl.report.game import GAMES, MOST_STEPS, typical_game
 from giril_rl.report.game_reward import draw_game, rewards_of
 from giril_rl.report.predictions import Shown, draw_predictions, foresee, spread
 from giril_rl.report.rows import Panel, Row
@@ -77,7 +77,8 @@ _EXPLAINED = (
     "the reward is of all four frames, as the module has it before any averaging and scaling. "
     "Transitions are evenly spread in time. Along a game: the same reward, step by step, and "
     "dashed its mean over the demonstration; below, without the steps that begin a life, while "
-    "the stack is not yet full of frames. The policy samples its actions. The picture ends "
+    "the stack is not yet full of frames. The policy samples its actions; of "
+    f"{GAMES} games the one of median score is shown. The picture ends "
     f"after {MOST_STEPS:,} steps, where beta is below 1 after {MOST_STEPS_LITERAL:,}.\n"
 )
 
@@ -89,7 +90,7 @@ def _pictures(panel: Panel, row: Row, run: RunRecord, out: Path) -> str:
     demo = find_demonstration(run.folder, run.below)
     most = MOST_STEPS if model.beta == 1 else MOST_STEPS_LITERAL
     agent = load_agent(run.folder, task)
-    game = play_game(agent, task, seed=scoring.seed, most=most)
+    game, seed = typical_game(agent, task, seed=scoring.seed, most=most)
     length = f"{len(game.lives):,} steps"
     played = f"a whole game of {length}" if game.whole else f"the first {length} of a game"
 
@@ -113,7 +114,7 @@ def _pictures(panel: Panel, row: Row, run: RunRecord, out: Path) -> str:
     settings = f" `{row.settings}`" if row.settings else ""
     without = "" if demo is not None else f" {_NO_DEMONSTRATION}"
     return (
-        f"{about}{settings}: `{run.name}`; {played}, seed {scoring.seed}.{without}\n\n"
+        f"{about}{settings}: `{run.name}`; {played}, seed {seed}.{without}\n\n"
         f"![predictions, {about}](predictions-{name}.png)\n\n"
         f"![reward along a game, {about}](reward-{name}.png)\n"
     )

@@ -111,7 +111,7 @@ def evaluate_run(folder: Path, episodes: int | None = None, seed: int | None = N
     if result["method"] == RANDOM:
         agent = RandomPolicy.of_task(task, result["seed"])
     elif result["method"] == HELD_ACTION:
-        agent = HeldAction.of_task(task, result.get("held_action"))
+        agent = HeldAction.of_task(task, result.get("held_action", -1))
     else:
         agent = load_agent(folder, task)
     episodes = settings.episodes if episodes is None else episodes

@@ -7,7 +7,7 @@ from tensordict.nn import TensorDictModule
 
 from giril_rl.configs import TaskConfig
 from giril_rl.envs.atari_game import AtariGame
-from giril_rl.report.game import play_game
+from giril_rl.report.game import play_game, typical_game
 
 pytest.importorskip("ale_py")
 
@@ -70,3 +70,12 @@ def test_a_long_game_is_cut_and_random_numbers_are_left_alone(game):
     assert not cut.whole and len(cut.transitions) == 12
     assert (cut.transitions == game.transitions[:12]).all()
     assert torch.equal(torch.get_rng_state(), before)
+
+
+def test_the_typical_game_is_the_one_of_median_score():
+    games = {seed: play_game(Random(), task("life"), seed=seed) for seed in range(20, 25)}
+    scores = sorted(game.score[-1] for game in games.values())
+    assert scores[0] < scores[2] < scores[4]
+    found, seed = typical_game(Random(), task("life"), seed=20)
+    assert seed in games and found.score[-1] == scores[2]
+    assert (found.transitions == games[seed].transitions).all()
