@@ -72,7 +72,7 @@ def test_the_lowest_seed_of_a_row_has_two_pictures(run, made, capsys):
     assert re.findall(r"\]\((.*?)\)", section) == sorted(pictures)
     assert all(content.startswith(b"\x89PNG") for content in pictures.values())
     about = r"^GIRIL \(released\), seed 1, 49,999,872 steps: `giril/breakout/task=.*,seed=1`; "
-    assert re.search(about + r"a whole game of \d+ steps, seed 10000\.$", section, re.M)
+    assert re.search(about + r"a whole game of \d+ steps, seed 1000[0-4]\.$", section, re.M)
     assert "not in the folder" not in section
     assert report(made, capsys) == (section, pictures)
 
