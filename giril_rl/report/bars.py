@@ -67,7 +67,7 @@ def draw_bars(panels: Sequence[Panel], path: Path) -> bool:
             axes.axvline(expert / score, color=EXPERT, linestyle=(0, (6, 3)), linewidth=1.0)
         axes.margins(x=0.05)
         axes.set_title(f"{panel.title}\n{budget_text(rows)}", fontsize=10)
-        axes.set_xlabel("mean score / demonstration's score")
+        axes.set_xlabel(f"mean score / score of the {panel.demonstration}")
         axes.grid(axis="x", alpha=0.3)
     for axes in grid[len(found) :]:
         axes.set_visible(False)

@@ -174,18 +174,18 @@ def _draw(
 
 
 def _references(axes: Any, panel: Panel) -> None:
-    for who, color, linestyle, width in (
-        ("expert", EXPERT, (0, (6, 3)), 1.0),
-        ("demonstration", DEMONSTRATION, (0, (1, 1)), 2.2),
+    for who, name, color, linestyle, width in (
+        ("expert", "expert", EXPERT, (0, (6, 3)), 1.0),
+        ("demo", panel.demonstration, DEMONSTRATION, (0, (1, 1)), 2.2),
     ):
-        value = panel.reference("demo" if who == "demonstration" else who)
+        value = panel.reference(who)
         if value is not None:
             axes.axhline(
                 value,
                 color=color,
                 linestyle=linestyle,
                 linewidth=width,
-                label=f"{who} ({value:,.1f})",
+                label=f"{name} ({value:,.1f})",
                 zorder=1,
             )
 

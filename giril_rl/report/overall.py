@@ -41,7 +41,7 @@ def overall(panels: Sequence[Panel]) -> str:
     if not lines:
         return ""
     tasks = "; ".join(
-        f"{panel.title} (demonstration {score:,.1f}, {budget_text(rows)})"
+        f"{panel.title} ({panel.demonstration} {score:,.1f}, {budget_text(rows)})"
         for panel, score, rows in found
     )
     text = (

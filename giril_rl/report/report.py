@@ -119,7 +119,7 @@ def _caption(table: Table) -> str:
     references = [
         f"{words} {value:,.1f}"
         for words, value in (
-            ("demonstration", panel.reference("demo")),
+            (panel.demonstration, panel.reference("demo")),
             ("expert", panel.reference("expert")),
         )
         if value is not None

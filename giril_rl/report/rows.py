@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
+from giril_rl.configs import is_atari
 from giril_rl.report.ablations import ABLATION_KEYS
 from giril_rl.report.paper import paper_figure
 from giril_rl.report.runs import RunRecord
@@ -176,6 +177,14 @@ class Panel:
     def main(self) -> list[Row]:
         """The rows with the recipes' own settings."""
         return [row for row in self.rows if not row.changes]
+
+    @property
+    def demonstration(self) -> str:
+        """What the demonstration is called: one life's score is not to be read as a game's."""
+        configs = [run.config for row in self.rows for run in row.runs]
+        lives = {config["demo.lives"] for config in configs if "demo.lives" in config}
+        atari = any(is_atari(str(config.get("task.env_id"))) for config in configs)
+        return "demonstration of one life" if atari and lives == {"first"} else "demonstration"
 
     def reference(self, who: str) -> float | None:
         """Mean return of the ``expert`` or the ``demo`` that most runs have; main rows first."""

@@ -1,5 +1,6 @@
 """Which runs make a row: those that differ in their seed alone."""
 
+import pytest
 import yaml
 
 from giril_rl.report.formats import seeds_text
@@ -252,3 +253,19 @@ def test_a_random_policy_alone_is_no_control_to_beat(made):
     made("bc", score=3.0)
     (panel,) = panels(made)
     assert all(line.improvement is None for line in tables_of(panel)[0].lines)
+
+
+@pytest.mark.parametrize(
+    ("words", "name"),
+    [
+        (["task=breakout"], "demonstration of one life"),
+        (["task=breakout", "demo.lives=all"], "demonstration"),
+        ([], "demonstration"),
+    ],
+)
+def test_one_life_is_not_called_a_whole_demonstration(made, words, name):
+    """Scores are of whole games, and are divided by it as in the paper."""
+    made("giril", *words, score=2.0)
+    made("control", *(word for word in words if "task" in word), score=1.0)
+    (panel,) = panels(made)
+    assert panel.demonstration == name
