@@ -7,6 +7,7 @@ import torch
 import yaml
 from gymnasium.wrappers import AtariPreprocessing
 from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
 from torchrl.envs.utils import check_env_specs
 
 from giril_rl.configs import TaskConfig
@@ -15,6 +16,7 @@ from giril_rl.envs.atari import Opened
 from giril_rl.envs.atari_game import AtariGame
 from giril_rl.errors import UserError
 from giril_rl.recipes import shipped_conf
+from giril_rl.training import evaluate
 
 ale_py = pytest.importorskip("ale_py")
 gymnasium.register_envs(ale_py)
@@ -175,6 +177,39 @@ def test_whole_game_scores_are_those_of_a_plain_loop(name):
     assert shown.over and plain == score and score > 0
 
 
+class Watching:
+    """Chooses by what it sees, so that each game is played in its own way."""
+
+    def acting(self):
+        return TensorDictModule(
+            lambda seen: seen[:, -1].long().sum((1, 2)) % 4, ["observation"], ["action"]
+        )
+
+
+def test_scores_of_an_evaluation_are_those_of_plain_loops():
+    """Games of different lengths, played side by side until the last one is over."""
+    scores = evaluate(Watching(), BREAKOUT, episodes=4, seed=7, deterministic=True)
+    returns, steps, lost = [], 0, 0
+    for number in range(4):
+        game = AtariGame("breakout")
+        _, lives = game.reset(int(np.random.SeedSequence([7, number, 0]).generate_state(1)[0]))
+        shown, score = [game.play(action) for action in (1, 2)][-1], 0.0
+        while not shown.over:
+            shown = game.play(int(shown.frame.astype(np.int64).sum()) % 4)
+            score, steps = score + shown.reward, steps + 1
+            if shown.lives < lives:
+                lost += 1
+            if 0 < shown.lives < lives:
+                for action in (0, 1, 2):
+                    before, shown = shown.lives, game.play(action)
+                    score += shown.reward
+                    assert shown.lives == before
+            lives = shown.lives
+        returns.append(score)
+    assert scores.returns == returns and len(set(returns)) > 1
+    assert scores.life_length_mean == pytest.approx(steps / lost) and lost == 20
+
+
 def test_lost_lives_show_in_whole_games_too():
     env = AtariEnv("breakout", 1, episode="game", seed=0)
     batch = play(env, 500)
@@ -206,7 +241,8 @@ def test_a_game_is_cut_at_the_frame_cap():
     env = AtariEnv("breakout", 1, episode="game", frame_cap=60)
     batch = play(env, 15)
     ends = batch["next", "truncated"].squeeze(-1)[0]
-    assert ends.any() and not batch["next", "terminated"].any()
+    # 60 frames are 15 steps, two of which open the game.
+    assert ends.nonzero().tolist() == [[12]] and not batch["next", "terminated"].any()
     assert torch.equal(ends, batch["next", "done"].squeeze(-1)[0])
     assert torch.equal(ends, batch["next", "game_over"].squeeze(-1)[0])
 
