@@ -82,7 +82,10 @@ class KeyCheck:
             raise UserError(f"{text} gives several values: add -m to run one after another.")
         if key in self.groups:
             if override.value() not in self.groups[key]:
-                raise UserError(f"{text}: choose one of {', '.join(self.groups[key])}.")
+                known = ", ".join(self.groups[key])
+                if key == "task":
+                    known += ", or give a Gymnasium id, such as task.env_id=ALE/Pong-v5"
+                raise UserError(f"{text}: choose one of {known}.")
             return
         for leaf_key, value in _flat(key, override.value(), self.leaves):
             self.value(leaf_key, value, text)

@@ -127,7 +127,8 @@ def test_every_shipped_recipe_composes_with_every_choice(recipe):
             ["task=foo"],
             "task=foo: choose one of ant, atari, beam_rider, breakout, gymnasium, half_cheetah, "
             "hopper, inverted_double_pendulum, inverted_pendulum, inverted_pendulum_swingup, "
-            "kung_fu_master, qbert, reacher, seaquest, space_invaders, walker2d.",
+            "kung_fu_master, qbert, reacher, seaquest, space_invaders, walker2d, or give "
+            "a Gymnasium id, such as task.env_id=ALE/Pong-v5.",
         ),
         (["profile=foo"], "profile=foo: choose one of paper, released."),
         (["seed=abc"], "seed=abc: a whole number is needed."),
