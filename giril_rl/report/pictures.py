@@ -6,7 +6,7 @@ from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
 
-from giril_rl.configs import DemoConfig, is_atari
+from giril_rl.configs import DemoConfig
 from giril_rl.demos import Demonstration
 from giril_rl.errors import UserError
 from giril_rl.naming import safe
@@ -45,14 +45,10 @@ def draw_pictures(panels: Sequence[Panel], out: Path) -> list[str]:
     """
     sections = []
     for panel in panels:
-        rows = [row for row in panel.rows if row.method in GENERATIVE and _is_atari(row.runs[0])]
+        rows = [row for row in panel.rows if row.method in GENERATIVE and row.runs[0].is_atari]
         if rows:
             sections.append(_section(panel, rows, out))
     return sections
-
-
-def _is_atari(run: RunRecord) -> bool:
-    return is_atari(str(run.config.get("task.env_id")))
 
 
 def _section(panel: Panel, rows: Sequence[Row], out: Path) -> str:

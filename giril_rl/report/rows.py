@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
-from giril_rl.configs import is_atari
 from giril_rl.report.ablations import ABLATION_KEYS
 from giril_rl.report.paper import paper_figure
 from giril_rl.report.runs import RunRecord
@@ -181,9 +180,9 @@ class Panel:
     @property
     def demonstration(self) -> str:
         """What the demonstration is called: one life's score is not to be read as a game's."""
-        configs = [run.config for row in self.rows for run in row.runs]
-        lives = {config["demo.lives"] for config in configs if "demo.lives" in config}
-        atari = any(is_atari(str(config.get("task.env_id"))) for config in configs)
+        runs = [run for row in self.rows for run in row.runs]
+        lives = {run.config["demo.lives"] for run in runs if "demo.lives" in run.config}
+        atari = any(run.is_atari for run in runs)
         return "demonstration of one life" if atari and lives == {"first"} else "demonstration"
 
     def reference(self, who: str) -> float | None:

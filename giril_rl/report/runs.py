@@ -8,6 +8,7 @@ from typing import Any
 
 import yaml
 
+from giril_rl.configs import is_atari
 from giril_rl.errors import UserError
 from giril_rl.formats import check_run_format
 from giril_rl.schema import flat
@@ -48,6 +49,11 @@ class RunRecord:
     def steps(self) -> int:
         """The budget that the run was given."""
         return int(self.config["steps"])
+
+    @property
+    def is_atari(self) -> bool:
+        """Whether its task is a game of the Arcade Learning Environment."""
+        return is_atari(str(self.config.get("task.env_id")))
 
     def metrics(self) -> list[dict[str, Any]]:
         """The rows of its ``metrics.jsonl``."""

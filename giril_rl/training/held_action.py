@@ -8,7 +8,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.data import TensorSpec
 
 from giril_rl.configs import TaskConfig
-from giril_rl.envs import make_env
+from giril_rl.demos.task import spaces_of
 from giril_rl.errors import UserError
 from giril_rl.progress import progress
 from giril_rl.training.evaluate import evaluate
@@ -49,7 +49,7 @@ class HeldAction(TensorDictModuleBase):
     @classmethod
     def of_task(cls, task: TaskConfig, action: int) -> HeldAction:
         """The policy on a task's action space."""
-        return cls(_action_spec(task), action)
+        return cls(spaces_of(task)[1], action)
 
     def acting(self) -> HeldAction:
         """Itself, for it remembers nothing."""
@@ -66,7 +66,7 @@ def check_discrete(task: TaskConfig) -> None:
     Raises:
         UserError: for actions that are not discrete.
     """
-    _number_of_actions(_action_spec(task))
+    _number_of_actions(spaces_of(task)[1])
 
 
 def held_action_scores(task: TaskConfig, *, episodes: int, seed: int) -> list[float]:
@@ -83,7 +83,7 @@ def held_action_scores(task: TaskConfig, *, episodes: int, seed: int) -> list[fl
         >>> len(scores), all(8 <= score <= 11 for score in scores)
         (2, True)
     """
-    spec = _action_spec(task)
+    spec = spaces_of(task)[1]
     scores = []
     count = _number_of_actions(spec)
     with progress(count, desc="held actions", unit="actions") as bar:
@@ -93,12 +93,6 @@ def held_action_scores(task: TaskConfig, *, episodes: int, seed: int) -> list[fl
             scores.append(played.return_mean)
             bar.update(1)
     return scores
-
-
-def _action_spec(task: TaskConfig) -> TensorSpec:
-    env = make_env(task, 1, seed=0)
-    env.close()
-    return env.action_spec
 
 
 def _number_of_actions(spec: TensorSpec) -> int:

@@ -8,7 +8,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.data import TensorSpec, Unbounded
 
 from giril_rl.configs import TaskConfig
-from giril_rl.envs import make_env
+from giril_rl.demos.task import spaces_of
 from giril_rl.errors import UserError
 
 RANDOM = "control:random"
@@ -54,9 +54,7 @@ class RandomPolicy(TensorDictModuleBase):
     @classmethod
     def of_task(cls, task: TaskConfig, seed: int = 0) -> RandomPolicy:
         """The random policy of a task's action space."""
-        env = make_env(task, 1, seed=0)
-        env.close()
-        return cls(env.action_spec, seed)
+        return cls(spaces_of(task)[1], seed)
 
     def acting(self) -> RandomPolicy:
         """The same policy from its first action on."""
