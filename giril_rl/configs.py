@@ -13,6 +13,8 @@ from typing import Any
 
 from omegaconf import MISSING
 
+COMPILE = "torch.compile of gradient steps, for long training on frames; half a minute to begin"
+
 
 def knob(
     default: Any,
@@ -124,6 +126,7 @@ class PPOConfig:
     hidden: list[int] = knob([100, 100], "hidden layers of policy and value network (tanh)", low=1)
     normalise_observations: bool = knob(True, "running observation normalisation, clipped at 10")
     checkpoint_every: int = knob(100_000, "environment steps between checkpoints", low=1)
+    compile: bool = knob(False, COMPILE)
 
 
 @dataclass
@@ -218,6 +221,7 @@ class AdversarialConfig:
     )
     hidden: list[int] = knob([100, 100], "hidden layers of the discriminator (tanh)", low=1)
     seed: int | None = knob(None, "seed of the discriminator; null takes the run's seed", low=0)
+    compile: bool = knob(False, COMPILE)
 
 
 @dataclass
@@ -262,6 +266,7 @@ class FitConfig:
     batch: int = knob(32, "transitions per gradient step", low=1)
     lr: float = knob(3e-5, "Adam step size", low=0, low_open=True)
     log_every: int = knob(500, "gradient steps between logged losses", low=1)
+    compile: bool = knob(False, COMPILE)
 
 
 @dataclass

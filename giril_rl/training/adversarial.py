@@ -48,7 +48,9 @@ class AdversarialLearner:
         self.loss = loss
         self.cfg = cfg
         self._pair_keys = loss.reward.in_keys
-        self.gradients = TracedGradients(loss, keys=loss.in_keys, log=loss.log_keys)
+        self.gradients = TracedGradients(
+            loss, keys=loss.in_keys, log=loss.log_keys, compile=cfg.compile
+        )
         device = self.gradients.parameters[0].device
         loss.to(device)  # VAIL's beta as well, which is the loss's and not the reward's.
         self._expert = [expert.get(key).contiguous().to(device) for key in self._pair_keys]

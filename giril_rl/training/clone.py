@@ -128,7 +128,7 @@ def clone_behaviour(
                     "minibatches": generator.get_state(),
                 }
                 run.save(phase, state)
-            if interrupt.requested and step < cfg.steps:
+            if interrupt.requested:
                 raise Interrupted.at(step, cfg.steps, "gradient steps")
     if cfg.stop == "held_out":
         agent.actor.load_state_dict(best["actor"])

@@ -54,7 +54,7 @@ def fit_reward(
         RunError: if a loss is no longer finite; the last checkpoint stays.
     """
     keys = loss.in_keys
-    gradients = TracedGradients(loss, keys=keys)
+    gradients = TracedGradients(loss, keys=keys, compile=cfg.compile)
     optimizer = torch.optim.Adam(gradients.parameters, lr=cfg.lr, fused=True)
     device = gradients.parameters[0].device
     data = data.to(device)
@@ -98,7 +98,7 @@ def fit_reward(
                     "rng": rng_state(device),
                 }
                 run.save(phase, state)
-            if interrupt.requested and step < cfg.steps:
+            if interrupt.requested:
                 raise Interrupted.at(step, cfg.steps, "fitting steps")
     loss.eval()
     return time.perf_counter() - began if saved is None or step > saved["step"] else seconds

@@ -111,6 +111,9 @@ def train_ppo(
         track_traj_ids=False,
         trust_policy=True,
         auto_register_policy_transforms=False,
+        # Each batch is made anew, so that it need not be copied before it is handed out.
+        use_buffers=False,
+        return_same_td=True,
     )
     # Only now, for making a collector may draw random numbers.
     torch.manual_seed(seed)
@@ -173,10 +176,10 @@ def train_ppo(
                     "reward_learner": None if learn_reward is None else learn_reward.state_dict(),
                 }
                 run.save(phase, state)
+            if interrupt.requested:  # At the last step as well, for the run may have more to do.
+                raise Interrupted.at(taken, steps)
             if stopped:
                 break
-            if interrupt.requested and taken < steps:
-                raise Interrupted.at(taken, steps)
     return Trained(taken, time.perf_counter() - began)
 
 
@@ -231,6 +234,7 @@ class PPOLearner:
             keys=self.keys,
             log=("kl_approx", "clip_fraction"),
             max_grad_norm=cfg.max_grad_norm,
+            compile=cfg.compile,
         )
         # The implementation that updates all parameters in one call.
         self.optimizer = torch.optim.Adam(

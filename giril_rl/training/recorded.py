@@ -10,20 +10,26 @@ from torch import Tensor
 from torch.fx.experimental.proxy_tensor import make_fx
 
 from giril_rl.randomness import restore_rng, rng_state
+from giril_rl.training.compiled import compiled
 
 
 def record(
-    function: Callable[..., tuple[Tensor, ...]], inputs: Sequence[Tensor]
+    function: Callable[..., tuple[Tensor, ...]],
+    inputs: Sequence[Tensor],
+    *,
+    compile: bool = False,
 ) -> Callable[..., tuple[Tensor, ...]]:
     """The plain tensor operations that ``function`` does for inputs of these shapes.
 
     Results that do not lead to an output are left out. Tensors that are not inputs are recorded as
-    they are now. Nothing is compiled, so that it takes a fraction of a second; the numbers are the
-    function's own, bit for bit, and random operations draw from the global generator as before.
+    they are now. Nothing is compiled unless asked for, so that it takes a fraction of a second; the
+    numbers are then the function's own, bit for bit, and random operations draw from the global
+    generator as before.
 
     Args:
         function: a function of tensors that returns a tuple of tensors; it may use autograd inside.
-        inputs: examples of its arguments.
+        inputs: examples of its arguments. The function is called with them once.
+        compile: see :func:`giril_rl.training.compiled.compiled`.
 
     Returns:
         A function of tensors of the same shapes; call it without gradient.
@@ -40,7 +46,12 @@ def record(
         graph.graph.eliminate_dead_code()
         graph.recompile()
         # On a CPU TorchScript runs the graph as it is; for a GPU it would compile parts of it anew.
-        on_cpu = inputs[0].device.type == "cpu"
-        recorded = torch.jit.trace(graph, tuple(inputs), check_trace=False) if on_cpu else graph
+        device = inputs[0].device
+        if compile:
+            recorded = compiled(graph, device)
+        elif device.type == "cpu":
+            recorded = torch.jit.trace(graph, tuple(inputs), check_trace=False)
+        else:
+            recorded = graph
     restore_rng(state)  # Recording must not consume the run's random numbers.
     return recorded

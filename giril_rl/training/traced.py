@@ -23,8 +23,8 @@ class TracedGradients:
     the time, and nothing is compiled (``torch.compile`` was both slower to start and slower to run
     for these sizes on a CPU: see ``tests/benchmarks``).
 
-    A module with convolutions is called as it is: they take nearly all of its time, their backward
-    pass cannot be recorded, and batch normalisation changes its statistics at each call.
+    A module with convolutions is called as it is, unless compiled: they take nearly all of its
+    time, and TorchScript does not run their backward pass.
 
     Tensors that are not parameters (coefficients, scales) are recorded as they are at the first
     call, so that they must not be replaced later. A new batch shape is recorded anew.
@@ -36,6 +36,7 @@ class TracedGradients:
         log: further scalar entries of the loss's output to return.
         max_grad_norm: joint norm above which the gradients are scaled down to it, as
             :func:`torch.nn.utils.clip_grad_norm_` does; None leaves them.
+        compile: compiles the graph, see :func:`giril_rl.training.compiled.compiled`.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -61,6 +62,7 @@ class TracedGradients:
         keys: Sequence[str | tuple[str, ...]],
         log: Sequence[str] = (),
         max_grad_norm: float | None = None,
+        compile: bool = False,
     ) -> None:
         self._loss = _Holder(loss)
         self._keys = list(keys)
@@ -70,7 +72,9 @@ class TracedGradients:
         self._names = [name for name, _ in named]
         self.parameters = [p for _, p in named]
         self._data = [p.detach() for p in self.parameters]
-        self._recorded = not any(isinstance(part, _CONVOLUTIONS) for part in loss.modules())
+        self._compile = compile
+        convolves = any(isinstance(part, _CONVOLUTIONS) for part in loss.modules())
+        self._recorded = compile or not convolves
         self._graphs: dict[tuple[torch.Size, ...], tuple[Callable, list[str]]] = {}
 
     def __call__(self, batch: TensorDictBase) -> dict[str, Tensor]:
@@ -128,7 +132,12 @@ class TracedGradients:
 
         if not self._recorded:
             return losses_and_gradients, names
-        return record(losses_and_gradients, [*self._data, *inputs]), list(names)
+        buffers = list(self._loss.buffers())
+        kept = [buffer.clone() for buffer in buffers]
+        graph = record(losses_and_gradients, [*self._data, *inputs], compile=self._compile)
+        for buffer, before in zip(buffers, kept, strict=True):
+            buffer.copy_(before)  # Batch normalisation counts each call.
+        return graph, list(names)
 
 
 class _Holder(nn.Module):

@@ -114,10 +114,12 @@ def main() -> None:
         "--num-envs", type=int, default=8, help="games; a batch is 128 steps of each"
     )
     parser.add_argument("--minibatch", type=int, default=256, help="transitions in a gradient step")
+    parser.add_argument("--compile", action="store_true", help="ours, its gradient steps")
     args = parser.parse_args()
     task = TaskConfig(name=args.game, env_id=f"ALE/{args.game}-v5")
     config = apply_task_defaults(RunConfig(task=task))
     config.ppo.num_envs, config.ppo.minibatch = args.num_envs, args.minibatch
+    config.ppo.compile = args.compile
     steps = args.batches * config.ppo.num_envs * config.ppo.rollout
     spawning = multiprocessing.get_context("spawn")
     pair = {}

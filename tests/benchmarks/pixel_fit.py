@@ -28,6 +28,7 @@ def main() -> None:
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--steps", type=int, default=100)
     parser.add_argument("--threads", type=int, default=os.cpu_count())
+    parser.add_argument("--compile", action="store_true")
     args = parser.parse_args()
     warnings.simplefilter("ignore")
     torch.set_num_threads(args.threads)
@@ -36,7 +37,7 @@ def main() -> None:
     loss = GenerativeRewardLoss(GenerativeReward.for_pixels(env.action_spec).to(args.device))
     # The first steps choose algorithms, and each block ends with the losses of the whole set.
     for steps in (10, args.steps):
-        cfg = FitConfig(steps=steps, log_every=steps)
+        cfg = FitConfig(steps=steps, log_every=steps, compile=args.compile)
         with (
             tempfile.TemporaryDirectory() as folder,
             Run.open(Path(folder) / "run", {}, recipe="benchmark") as run,

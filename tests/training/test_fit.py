@@ -123,6 +123,7 @@ def test_a_fit_stopped_again_and_again_ends_bit_for_bit_as_an_undisturbed_one(
     weights, rows = fitted(tmp_path / "whole", held_out=held_out, log_every=log_every)
     log = Run.log
     stops = [(1, Killed), (1, Interrupted), (4, Killed), (5, Interrupted), (6, Killed)]
+    stops.append((60 / log_every, Interrupted))  # At the last step.
     for number, how in stops:
         with monkeypatch.context() as patch, pytest.raises(how):
 
@@ -214,9 +215,10 @@ def test_the_logged_loss_of_frames_is_that_of_eval_mode(tmp_path):
         assert logged != pytest.approx(normalised_by_the_batch[f"loss_{term}"].item(), rel=1e-2)
 
 
-def test_a_fit_of_frames_is_resumed_bit_for_bit_with_its_statistics(tmp_path, monkeypatch):
+@pytest.mark.parametrize("compile", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_a_fit_of_frames_is_resumed_bit_for_bit_with_its_statistics(compile, tmp_path, monkeypatch):
     monkeypatch.setattr(fit, "CHECKPOINT_EVERY", 4)
-    expected, expected_rows = fit_frames(tmp_path / "whole")
+    expected, expected_rows = fit_frames(tmp_path / "whole", compile=compile)
     log = Run.log
     for step, how in ((2, Interrupted), (6, Killed)):
         with monkeypatch.context() as patch, pytest.raises(how):
@@ -229,9 +231,9 @@ def test_a_fit_of_frames_is_resumed_bit_for_bit_with_its_statistics(tmp_path, mo
                     signal.raise_signal(signal.SIGINT)
 
             patch.setattr(Run, "log", log_and_stop)
-            fit_frames(tmp_path / "run")
+            fit_frames(tmp_path / "run", compile=compile)
         torch.manual_seed(99)
-    found, found_rows = fit_frames(tmp_path / "run")
+    found, found_rows = fit_frames(tmp_path / "run", compile=compile)
     assert found.keys() == expected.keys()
     assert any(name.endswith("running_var") for name in found)
     for name, value in expected.items():

@@ -270,6 +270,7 @@ CASES = {
         "relabel": partial(learned_reward, beta=0.6),
         "anneal_lr": True,
     },
+    "cartpole, compiled": {"env_id": "CartPole-v1", "compile": True},
     "true reward, no normalisation": {
         "env_id": "CartPole-v1",
         "relabel": lambda env: Compose(ReturnScaling(0.99, reset="done")),
@@ -283,8 +284,9 @@ def test_a_run_stopped_again_and_again_ends_bit_for_bit_as_an_undisturbed_one(
     case, tmp_path, monkeypatch
 ):
     _, expected = train(tmp_path / "whole", **CASES[case])
-    # Before the first checkpoint; at an extra checkpoint; between two checkpoints.
-    for number, how in ((1, Killed), (1, Interrupted), (3, Killed), (3, Interrupted)):
+    # Before the first checkpoint; at an extra checkpoint; between two checkpoints; at the end.
+    stops = (1, Killed), (1, Interrupted), (3, Killed), (3, Interrupted), (4, Interrupted)
+    for number, how in stops:
         with monkeypatch.context() as patch, pytest.raises(how):
             stop_in_batch(patch, number, how)
             train(tmp_path / "run", **CASES[case])
