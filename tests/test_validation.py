@@ -179,6 +179,7 @@ class Adversarial(RunConfig):
 @pytest.mark.parametrize("kind", [Config, Curious, Adversarial])
 def test_frames_and_vectors_are_not_normalised_alike(kind, env_id, rule, right):
     config = kind(task=TaskConfig(name="reach", env_id=env_id), steps=10_000)
+    config.ppo.normalise_observations = right != "pixels"
     config.reward.normalise = rule
     with pytest.raises(UserError) as refusal:
         validate(config)
@@ -194,6 +195,7 @@ def test_frames_and_vectors_are_not_normalised_alike(kind, env_id, rule, right):
 def test_the_controls_models_are_held_to_the_same(part):
     config = Control(task=TaskConfig(name="pong", env_id="ALE/Pong-v5"), steps=10_000)
     config.giril.normalise = config.icm.normalise = "pixels"
+    config.ppo.normalise_observations = False
     validate(config)
     getattr(config, part).normalise = "demo_range"
     with pytest.raises(UserError, match=rf"^{part}\.normalise=demo_range .*=pixels\.$"):
@@ -206,7 +208,7 @@ def test_games_have_no_fixed_horizon(after_failure):
     config.task = TaskConfig(
         name="pong", env_id="ALE/Pong-v5", horizon="fixed", after_failure=after_failure
     )
-    config.reward.normalise = "pixels"
+    config.reward.normalise, config.ppo.normalise_observations = "pixels", False
     with pytest.raises(UserError) as refusal:
         validate(config)
     assert str(refusal.value) == "task.horizon=fixed is for vector tasks: leave task.horizon=own."
@@ -223,6 +225,7 @@ def test_steps_of_atari_s_expert_are_its_own_batches(steps, fits):
         expert: ExpertConfig = field(default_factory=lambda: ExpertConfig(steps=steps))
 
     config = WithExpert(task=TaskConfig(name="pong", env_id="ALE/Pong-v5"), steps=10_000)
+    config.ppo.normalise_observations = False
     if fits:
         validate(config)
     else:
@@ -279,7 +282,7 @@ def test_bounds_of_an_open_upper_end():
 def test_layers_of_vectors_are_not_for_frames(part, name):
     kind = Curious if name == "model_hidden" else Config
     config = kind(task=TaskConfig(name="pong", env_id="ALE/Pong-v5"), steps=10_000)
-    config.reward.normalise = "pixels"
+    config.reward.normalise, config.ppo.normalise_observations = "pixels", False
     validate(config)
     setattr(getattr(config, part), name, [64])
     with pytest.raises(UserError) as refusal:
@@ -289,6 +292,15 @@ def test_layers_of_vectors_are_not_for_frames(part, name):
         "out."
     )
     config.task.env_id, config.reward.normalise = "Reach-v0", "raw"
+    validate(config)
+
+
+def test_frames_have_no_running_normalisation():
+    config = Config(task=TaskConfig(name="pong", env_id="ALE/Pong-v5"), steps=10_000)
+    config.reward.normalise = "pixels"
+    with pytest.raises(UserError, match=r"^ppo\.normalise_observations=true .* leave it out\.$"):
+        validate(config)
+    config.ppo.normalise_observations = False
     validate(config)
 
 
