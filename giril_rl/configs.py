@@ -13,7 +13,7 @@ from typing import Any
 
 from omegaconf import MISSING
 
-COMPILE = "torch.compile of gradient steps, for long training on frames; half a minute to begin"
+COMPILE = "torch.compile of gradient steps: for long training on frames, 20 seconds to begin"
 
 
 def knob(

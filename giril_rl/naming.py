@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -13,8 +13,13 @@ from typing import Any
 from giril_rl.configs import ExpertRunConfig
 
 _OWN_PLACE = {"task", "task.name", "seed"}
-NO_EFFECT = frozenset({"out", "root", "logger", "threads", "device"})
-"""Keys that change where and how fast a run is made, not its numbers (but for their rounding)."""
+NO_EFFECT = frozenset(
+    {"out", "root", "logger", "threads", "device", "ppo.compile", "fit.compile", "reward.compile"}
+)
+"""Keys that change where and how fast a run is made, and not what it computes.
+
+Rounding may differ, and on another device or compiled a reward model's noise.
+"""
 _LONGEST = 80
 ADDED = {
     "task.expert_steps": 5_000_000,
@@ -29,7 +34,9 @@ ADDED = {
 """Keys that earlier runs did not have, with the value that they behaved by."""
 
 
-def without_added(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+def without_added(
+    values: Mapping[str, Any], prefix: str = "", *, drop: Collection[str] = ()
+) -> dict[str, Any]:
     """Nested settings less the keys of :data:`ADDED` that have the value given there.
 
     What is hashed or compared this way is the same as before those keys existed.
@@ -37,6 +44,7 @@ def without_added(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]
     Args:
         values: nested settings.
         prefix: dotted key of ``values`` itself, with the dot.
+        drop: further dotted keys to leave out, whatever their values.
 
     Examples:
         >>> without_added({"seed": 1, "task": {"name": "reach", "horizon": "own"}})
@@ -47,8 +55,10 @@ def without_added(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]
     kept: dict[str, Any] = {}
     for name, value in values.items():
         key = f"{prefix}{name}"
+        if key in drop:
+            continue
         if isinstance(value, Mapping):
-            kept[name] = without_added(value, f"{key}.")
+            kept[name] = without_added(value, f"{key}.", drop=drop)
         elif key not in ADDED or ADDED[key] != value:
             kept[name] = value
     return kept
@@ -68,8 +78,7 @@ def config_hash(config: Any) -> str:
         >>> config_hash(RunConfig(seed=1)) == config_hash(RunConfig(seed=1, root="elsewhere"))
         True
     """
-    settings = without_added(asdict(config))
-    values = {key: value for key, value in settings.items() if key not in NO_EFFECT}
+    values = without_added(asdict(config), drop=NO_EFFECT)
     return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:12]
 
 

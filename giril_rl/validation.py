@@ -117,11 +117,11 @@ def _check_normalise(config: Any) -> None:
 
 
 def _check_layers(config: RunConfig) -> None:
-    """The networks of frames are the paper's: what would change those of vectors has no effect."""
+    """The networks of frames are the paper's: what changes those of vectors would do nothing."""
     if config.ppo.normalise_observations:
         raise UserError(
-            f"ppo.normalise_observations=true is for vectors, and the frames of {config.task.name} "
-            "are divided by 255: leave it out."
+            f"ppo.normalise_observations=true is for vectors, and {config.task.name} has frames, "
+            "which are divided by 255: leave it out."
         )
     for part in fields(config):
         value = getattr(config, part.name)

@@ -1,25 +1,55 @@
-import hashlib
-import json
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, field, replace
 
-from giril_rl.configs import ControlRunConfig, ExpertRunConfig, PPOConfig, TaskConfig
-from giril_rl.naming import ADDED, config_hash, without_added
+import pytest
+
+from giril_rl.configs import (
+    BottleneckConfig,
+    ControlRunConfig,
+    ExpertRunConfig,
+    FitConfig,
+    GenerativeConfig,
+    PPOConfig,
+    RunConfig,
+    TaskConfig,
+)
+from giril_rl.naming import ADDED, NO_EFFECT, config_hash, variant, without_added
 from giril_rl.schema import leaves
 
 TASK = TaskConfig("pole", "Pole-v0", None, 300_000, 990.0)
 
 
-def test_later_keys_leave_the_hashes_of_earlier_runs_as_they_are():
-    """The configuration as it was written before those keys existed."""
-    config = ExpertRunConfig(task=TASK)
-    values = asdict(config)
-    for key in ("horizon", "after_failure", "expert_steps", "episode"):
-        del values["task"][key]
-    del values["ppo"]["clip_value"]
-    for key in ("termination", "clip_reward", "device", "out", "root", "logger", "threads"):
-        del values[key]
-    digest = hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
-    assert config_hash(config) == digest[:12]
+@dataclass
+class Fitted(RunConfig):
+    reward: GenerativeConfig = field(default_factory=GenerativeConfig)
+    fit: FitConfig = field(default_factory=FitConfig)
+
+
+@dataclass
+class Adversarial(RunConfig):
+    reward: BottleneckConfig = field(default_factory=BottleneckConfig)
+
+
+@pytest.mark.parametrize(
+    ("kind", "digest"),
+    [
+        (ExpertRunConfig, "c75bce4ec8b4"),
+        (Fitted, "a03ad6f3d6e9"),
+        (Adversarial, "3f35f5a0399c"),
+    ],
+)
+def test_later_keys_leave_the_hashes_of_earlier_runs_as_they_are(kind, digest):
+    """Recipes find their players by it: a new key belongs into ADDED or NO_EFFECT."""
+    assert config_hash(kind(task=TaskConfig("pole", "Pole-v0"))) == digest
+
+
+def test_what_has_no_effect_is_in_no_hash():
+    config = Adversarial(task=TASK)
+    fast = Adversarial(task=TASK, device="cuda", ppo=PPOConfig(compile=True))
+    fast.reward.compile = True
+    assert config_hash(fast) == config_hash(config)
+    assert variant({"ppo.compile": "ppo.compile=True", "device": "device=cuda"}) == "default"
+    kinds = (ExpertRunConfig, ControlRunConfig, Fitted, Adversarial)
+    assert {leaf.key for kind in kinds for leaf in leaves(kind)} >= NO_EFFECT
 
 
 def test_later_keys_count_where_they_change_something():

@@ -117,7 +117,8 @@ def clone_behaviour(
             metrics = {f"{phase}/{name}/loss": value for name, value in losses.items()}
             run.log(step, metrics, phase=phase)
             finite.losses(metrics, step)
-            if step % CHECKPOINT_EVERY < block or step == cfg.steps or interrupt.requested:
+            asked = interrupt.requested
+            if step % CHECKPOINT_EVERY < block or step == cfg.steps or asked:
                 seconds = time.perf_counter() - began
                 state = {
                     "step": step,
@@ -128,8 +129,10 @@ def clone_behaviour(
                     "minibatches": generator.get_state(),
                 }
                 run.save(phase, state)
-            if interrupt.requested:
-                raise Interrupted.at(step, cfg.steps, "gradient steps")
+            if asked:
+                break
+    if interrupt.requested:  # At the end as well, for the run may have more to do.
+        raise Interrupted.at(step, cfg.steps, "gradient steps")
     if cfg.stop == "held_out":
         agent.actor.load_state_dict(best["actor"])
     set_deviation(agent, sets["held_out" if cfg.stop == "held_out" else "fitted"], cfg.min_std)

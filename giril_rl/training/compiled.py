@@ -57,20 +57,22 @@ def compiled(
 
 @contextlib.contextmanager
 def _compiling() -> Iterator[None]:
-    """Keeps Ctrl-C for later, and tells in a sentence what went wrong.
+    """Keeps Ctrl-C from the compiler's processes, and tells in a sentence what went wrong.
 
-    A terminal sends Ctrl-C to the C++ compiler as well, whose broken library would stay in torch's
-    cache. It inherits which signals are blocked.
+    A terminal sends Ctrl-C to them as well, and the library that one was writing would stay in
+    torch's cache, broken. They inherit which signals are blocked; this process stops at the next
+    safe point, as ever.
     """
-    resource_tracker.ensure_running()  # Where that is left to torch, it unblocks Ctrl-C.
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    resource_tracker.ensure_running()  # Where that is left to torch, it unblocks the signals.
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
     try:
         yield
     except TorchDynamoException as error:
         reason = str(error).strip().partition("\n")[0]
         raise RunError(
-            f"torch could not compile the gradient steps ({reason}): leave compile=false, or see "
-            "whether a C++ compiler is installed; what was saved before is as it was."
+            f"torch could not compile the gradient steps ({reason}; --traceback shows all): give "
+            "the same command without compile=true, or see whether a C++ compiler is installed, "
+            "and for a GPU Triton; what was saved before is as it was."
         ) from error
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)

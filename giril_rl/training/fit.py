@@ -88,7 +88,8 @@ def fit_reward(
             losses = _evaluate(loss, {"fitted": data, "held_out": held_out})
             run.log(step, losses, phase=phase)
             finite.losses(losses, step)
-            if step % CHECKPOINT_EVERY < block or step == cfg.steps or interrupt.requested:
+            asked = interrupt.requested
+            if step % CHECKPOINT_EVERY < block or step == cfg.steps or asked:
                 state = {
                     "step": step,
                     "seconds": time.perf_counter() - began,
@@ -98,8 +99,10 @@ def fit_reward(
                     "rng": rng_state(device),
                 }
                 run.save(phase, state)
-            if interrupt.requested:
-                raise Interrupted.at(step, cfg.steps, "fitting steps")
+            if asked:
+                break
+    if interrupt.requested:  # At the end as well, for the run may have more to do.
+        raise Interrupted.at(step, cfg.steps, "fitting steps")
     loss.eval()
     return time.perf_counter() - began if saved is None or step > saved["step"] else seconds
 

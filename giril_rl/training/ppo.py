@@ -160,7 +160,8 @@ def train_ppo(
             finite.losses({**learned, **losses}, taken)
             if stop_at is not None and len(recent) == recent.maxlen:
                 stopped = sum(recent) / len(recent) >= stop_at
-            if taken >= next_save or taken >= steps or stopped or interrupt.requested:
+            asked = interrupt.requested
+            if taken >= next_save or taken >= steps or stopped or asked:
                 next_save += cfg.checkpoint_every
                 for part in (agent, relabel):  # Not the tracker: the true reward may be anything.
                     finite.weights(part, taken)
@@ -176,10 +177,10 @@ def train_ppo(
                     "reward_learner": None if learn_reward is None else learn_reward.state_dict(),
                 }
                 run.save(phase, state)
-            if interrupt.requested:  # At the last step as well, for the run may have more to do.
-                raise Interrupted.at(taken, steps)
-            if stopped:
+            if stopped or asked:
                 break
+    if interrupt.requested:  # At the end as well, for the run may have more to do.
+        raise Interrupted.at(taken, steps)
     return Trained(taken, time.perf_counter() - began)
 
 

@@ -19,12 +19,13 @@ class TracedGradients:
     For networks of a few hundred units most of a gradient step is Python: TensorDict look-ups,
     argument checks, statistics that nobody reads. Here the module's forward and backward pass are
     recorded for one shape as a graph of plain tensor operations, in which whatever does not lead to
-    a loss is dropped. The numbers are the module's own, bit for bit; a step takes less than half
-    the time, and nothing is compiled (``torch.compile`` was both slower to start and slower to run
-    for these sizes on a CPU: see ``tests/benchmarks``).
+    a loss is dropped. The numbers are the module's own, bit for bit, and a step takes less than
+    half the time. ``torch.compile`` was both slower to start and slower to run for these sizes on a
+    CPU (``tests/benchmarks/parts.py``).
 
-    A module with convolutions is called as it is, unless compiled: they take nearly all of its
-    time, and TorchScript does not run their backward pass.
+    A module with convolutions is called as it is: they take nearly all of its time, and TorchScript
+    does not run their backward pass. There ``compile=True`` pays, up to a third more steps a second
+    (``tests/benchmarks/compiled_steps.py``), with numbers that are the same to rounding.
 
     Tensors that are not parameters (coefficients, scales) are recorded as they are at the first
     call, so that they must not be replaced later. A new batch shape is recorded anew.

@@ -1,6 +1,8 @@
 """``compile=true``: the same gradient steps, by torch's compiler."""
 
 import copy
+import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -13,11 +15,16 @@ from torch import nn
 from torch._dynamo.exc import TorchDynamoException
 
 from giril_rl.errors import RunError
+from giril_rl.rewards import BottleneckLoss
 from giril_rl.training.compiled import compiled
-from giril_rl.training.interrupt import Interrupt
 from giril_rl.training.traced import TracedGradients
 
 ROWS = 6
+
+
+needs_compiler = pytest.mark.skipif(
+    shutil.which(os.environ.get("CXX", "g++")) is None, reason="there is no C++ compiler here"
+)
 
 
 class Autoencoder(nn.Module):
@@ -57,6 +64,7 @@ def seeded():
         yield
 
 
+@needs_compiler
 @pytest.mark.parametrize("bound", [None, 0.1])
 def test_ten_steps_are_those_without_it(bound):
     one = Autoencoder()
@@ -79,6 +87,7 @@ def test_ten_steps_are_those_without_it(bound):
     assert len(set(seen)) == 10
 
 
+@needs_compiler
 def test_another_shape_is_compiled_anew():
     module = Autoencoder()
     twin = copy.deepcopy(module)
@@ -89,6 +98,7 @@ def test_another_shape_is_compiled_anew():
         torch.testing.assert_close(*logs, rtol=1e-4, atol=1e-5)
 
 
+@needs_compiler
 def test_weights_that_are_loaded_are_used():
     module, other = Autoencoder(), Autoencoder()
     made, plain = gradients_of(module, compile=True), gradients_of(other)
@@ -99,6 +109,7 @@ def test_weights_that_are_loaded_are_used():
     torch.testing.assert_close(*logs, rtol=1e-4, atol=1e-5)
 
 
+@needs_compiler
 def test_random_numbers_follow_the_seed():
     made = gradients_of(Autoencoder(noise=1.0), compile=True)
     inputs = columns()
@@ -114,57 +125,64 @@ def test_random_numbers_follow_the_seed():
         assert made.step(inputs)["loss_error"] == expected
 
 
+@needs_compiler
 @pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
-def test_every_loss_on_frames(name):
-    gradients, inputs = CASES[name]()
-    modules = [gradients._loss.loss, copy.deepcopy(gradients._loss.loss)]
+def test_every_loss_on_frames(name, monkeypatch):
+    # The compiler draws other numbers.
+    monkeypatch.setattr(torch, "randn_like", lambda x: torch.full_like(x, 0.3))
+    monkeypatch.setattr(torch, "rand", lambda *shape, device: torch.full(shape, 0.3, device=device))
+    gradients, inputs = CASES[name](8)
+    losses = [gradients._loss.loss, copy.deepcopy(gradients._loss.loss)]
     made, plain = (
-        TracedGradients(module, keys=gradients._keys, compile=compile)
-        for module, compile in zip(modules, (True, False), strict=True)
+        TracedGradients(loss, keys=gradients._keys, compile=compile)
+        for loss, compile in zip(losses, (True, False), strict=True)
     )
-    noisy = name in ("giril", "vail", "gail with a penalty")
-    for _ in range(2):
+    for step in range(3):
         logs = [made.step(inputs), plain.step(inputs)]
-        torch.testing.assert_close(*logs, rtol=0.5 if noisy else 1e-3, atol=1e-4)
-    if not noisy:
+        torch.testing.assert_close(*logs, rtol=1e-3, atol=1e-4)
         largest = max(p.grad.norm() for p in plain.parameters)
         for one, other in zip(made.parameters, plain.parameters, strict=True):
             # Of a bias before batch statistics rounding is all that is left.
-            bound = 1e-3 * max(other.grad.norm(), 1e-3 * largest)
+            bound = 1e-2 * max(other.grad.norm(), 1e-3 * largest)
             assert (one.grad - other.grad).norm() <= bound
-
-
-def replaced(monkeypatch, call):
-    """``compiled`` with something else in place of torch's compiler."""
-    monkeypatch.setattr(torch, "compile", lambda graph, **_: call)
-    return compiled(lambda x: (x,), torch.device("cpu"))
+        for loss in losses:
+            if isinstance(loss, BottleneckLoss):
+                loss.update_beta(torch.tensor(30.0 * (step + 1)))
+        torch.testing.assert_close(*(dict(x.named_buffers()) for x in losses), rtol=1e-4, atol=1e-4)
 
 
 def test_without_a_compiler_there_is_one_sentence(monkeypatch):
     def fails(*_):
         raise TorchDynamoException("No working C++ compiler found\nfar below")
 
-    function = replaced(monkeypatch, fails)
-    with pytest.raises(RunError, match=r"\(No working C\+\+ compiler found\): leave compile=false"):
+    monkeypatch.setattr(torch, "compile", lambda graph, **_: fails)
+    function = compiled(lambda x: (x,), torch.device("cpu"))
+    with pytest.raises(RunError, match=r"\(No working C\+\+ compiler found; --traceback shows"):
         function(torch.ones(1))
-    assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, ())
+    assert not signal.pthread_sigmask(signal.SIG_BLOCK, ()) & {signal.SIGINT, signal.SIGTERM}
 
 
-def test_ctrl_c_reaches_neither_the_compiler_nor_is_it_lost(monkeypatch):
-    seen = []
+CTRL_C = """
+import multiprocessing.resource_tracker, os, signal, subprocess, sys, torch
+from giril_rl.training.compiled import compiled
+from giril_rl.training.interrupt import Interrupt
 
-    def compiles(x):
-        if not seen:
-            signal.raise_signal(signal.SIGINT)  # Before it starts: a process inherits the mask.
-            code = "import signal; signal.raise_signal(signal.SIGINT); print('done')"
-            started = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-            seen.append((interrupt.requested, started.stdout.strip()))
-        return (x,)
+def compiler(x):
+    multiprocessing.resource_tracker.ensure_running()  # As torch's does.
+    program = "import signal; signal.raise_signal(signal.SIGINT); print('compiled', flush=True)"
+    subprocess.run([sys.executable, "-c", program])
+    os.kill(os.getpid(), signal.SIGINT)
+    return (x,)
 
-    function = replaced(monkeypatch, compiles)
-    with Interrupt() as interrupt:
-        function(torch.ones(1))
-        assert seen == [(False, "done")]
-        assert interrupt.requested
-        function(torch.ones(1))
+torch.compile = lambda graph, **_: compiler
+with Interrupt() as interrupt:
+    compiled(lambda x: (x,), torch.device("cpu"))(torch.ones(1))
+print("asked to stop:", interrupt.requested)
+"""
+
+
+def test_ctrl_c_does_not_end_the_compiler_and_is_not_lost():
+    # A new process, for torch's compiler starts more of them at its first use.
+    run = subprocess.run([sys.executable, "-c", CTRL_C], capture_output=True, text=True)
+    assert run.stdout.splitlines() == ["compiled", "asked to stop: True"], run.stderr

@@ -16,7 +16,7 @@ from giril_rl.training.traced import TracedGradients
 @pytest.mark.parametrize("name", CASES)
 def test_every_weight_takes_its_own_step(name):
     torch.manual_seed(0)
-    gradients, inputs = CASES[name]()
+    gradients, inputs = CASES[name](8)
     parameters = gradients.parameters
     twins = [nn.Parameter(p.detach().clone()) for p in parameters]
     gradients.step(inputs)
