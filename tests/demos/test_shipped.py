@@ -47,9 +47,14 @@ def test_a_recipe_finds_it_by_its_task(name, tmp_path):
     assert not any(tmp_path.iterdir())
 
 
+def test_all_six_games_have_one():
+    games = {"space_invaders", "beam_rider", "breakout", "qbert", "seaquest", "kung_fu_master"}
+    assert set(shipped_demonstrations()) == games
+
+
 def test_there_is_no_other_one():
     pong = TaskConfig(name="pong", env_id="ALE/Pong-v5")
-    with pytest.raises(UserError, match="no demonstration of pong is shipped: there are breakout"):
+    with pytest.raises(UserError, match="pong is shipped: there are beam_rider, breakout, kung"):
         demonstration_folder("shipped", pong)
     with pytest.raises(UserError, match="did you mean 'breakout'"):
         demonstration_folder("shipped:breakou")
