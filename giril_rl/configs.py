@@ -126,7 +126,7 @@ class PPOConfig:
     hidden: list[int] = knob([100, 100], "hidden layers of policy and value network (tanh)", low=1)
     normalise_observations: bool = knob(True, "running observation normalisation, clipped at 10")
     checkpoint_every: int = knob(100_000, "environment steps between checkpoints", low=1)
-    compile: bool = knob(False, COMPILE)
+    compile: bool = knob(False, f"{COMPILE}; of the acting policy as well")
 
 
 @dataclass

@@ -49,6 +49,12 @@ if "StepCounter-v0" not in gymnasium.registry:
 
 
 @pytest.fixture(autouse=True)
+def same_random_numbers():
+    """torch's own first seed is another one in each process."""
+    torch.manual_seed(0)
+
+
+@pytest.fixture(autouse=True)
 def heeded_ctrl_c():
     """Tests send SIGINT, which a process that a script starts in the background ignores."""
     before = signal.getsignal(signal.SIGINT)

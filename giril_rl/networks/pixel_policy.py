@@ -8,8 +8,8 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor, nn
-from torchrl.envs.utils import ExplorationType, exploration_type
 
+from giril_rl.networks.acting import ActingPolicy
 from giril_rl.networks.distributions import CategoricalActions
 from giril_rl.networks.pixels import flat_frames
 from giril_rl.networks.space_to_depth import SpaceToDepthConv, deal
@@ -44,6 +44,7 @@ class PixelActorCritic(Pretrained, nn.Module):
 
     discrete = True
     log_std = None
+    acting_keys = ("action", "action_log_prob", "state_value")
     input_keys: tuple[str, ...] = (DEALT,)
     """What the networks in PPO's loss read of a minibatch."""
 
@@ -93,9 +94,20 @@ class PixelActorCritic(Pretrained, nn.Module):
     def update_normaliser(self, observation: Tensor) -> None:
         """Does nothing: frames are divided by a constant."""
 
-    def acting(self) -> PixelActingPolicy:
+    def act(self, observation: Tensor, *, greedy: bool = False) -> tuple[Tensor, Tensor, Tensor]:
+        """An action and its log-probability, ``(*batch)`` each, and the value ``(*batch, 1)``.
+
+        Args:
+            observation: uint8 frames ``(*batch, channels, 84, 84)``, where the weights are.
+            greedy: takes the most likely action rather than a draw.
+        """
+        distribution, value = self.distribution_and_value(observation)
+        action = distribution.mode if greedy else distribution.sample()
+        return action, distribution.log_prob(action), value
+
+    def acting(self) -> ActingPolicy:
         """The module that acts in an environment; shares this one's parameters."""
-        return PixelActingPolicy(self)
+        return ActingPolicy(self)
 
     def actor_for_loss(self) -> PixelLossActor:
         """The module that gives :class:`torchrl.objectives.ClipPPOLoss` its distribution."""
@@ -154,32 +166,6 @@ class PixelActor(nn.Module):
     def forward(self, observation: Tensor) -> Tensor:
         """The logits ``(*batch, actions)``."""
         return self.head(self.hidden(observation))
-
-
-class PixelActingPolicy(TensorDictModuleBase):
-    """Samples an action, or takes the mode under ``ExplorationType.DETERMINISTIC``.
-
-    Reads ``"observation"``, wherever it is; writes, in the same place, ``"action"``,
-    ``"action_log_prob"`` and ``"state_value"``, which advantages and the clipped value loss read
-    again.
-    """
-
-    def __init__(self, agent: PixelActorCritic) -> None:
-        super().__init__()
-        self.in_keys = ["observation"]
-        self.out_keys = ["action", "action_log_prob", "state_value"]
-        self.agent = agent
-
-    @torch.no_grad()
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the action for ``"observation"`` of any leading shape."""
-        seen = tensordict.get("observation")
-        distribution, value = self.agent.distribution_and_value(seen.to(self.agent.device))
-        greedy = exploration_type() == ExplorationType.DETERMINISTIC
-        action = distribution.mode if greedy else distribution.sample()
-        tensordict.set("action", action.to(seen.device))
-        tensordict.set("action_log_prob", distribution.log_prob(action).to(seen.device))
-        return tensordict.set("state_value", value.to(seen.device))
 
 
 class PixelLossActor(TensorDictModuleBase):

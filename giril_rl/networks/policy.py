@@ -10,8 +10,8 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.data import Categorical, TensorSpec
-from torchrl.envs.utils import ExplorationType, exploration_type
 
+from giril_rl.networks.acting import ActingPolicy
 from giril_rl.networks.distributions import CategoricalActions, DiagonalGaussian
 from giril_rl.networks.normalise import RunningNormaliser
 from giril_rl.networks.vectors import mlp
@@ -42,6 +42,8 @@ class ActorCritic(Pretrained, nn.Module):
         torch.Size([3])
     """
 
+    acting_keys = ("action", "action_log_prob", NORMALISED)
+    """What :meth:`act` returns, as the acting policy writes it."""
     input_keys: tuple[str, ...] = (NORMALISED,)
     """What the networks in PPO's loss read of a minibatch."""
 
@@ -115,31 +117,6 @@ class ActorCritic(Pretrained, nn.Module):
     def critic_for_loss(self) -> TensorDictModule:
         """The value network on normalised observations, writing ``"state_value"``."""
         return TensorDictModule(self.critic, in_keys=[NORMALISED], out_keys=["state_value"])
-
-
-class ActingPolicy(TensorDictModuleBase):
-    """Samples an action, or takes the mode under ``ExplorationType.DETERMINISTIC``.
-
-    Reads raw ``"observation"``, wherever it is; writes, in the same place, ``"action"``,
-    ``"action_log_prob"`` and the normalised observation, which the loss reads again and so need not
-    compute.
-    """
-
-    def __init__(self, agent: ActorCritic) -> None:
-        super().__init__()
-        self.in_keys = ["observation"]
-        self.out_keys = ["action", "action_log_prob", NORMALISED]
-        self.agent = agent
-
-    @torch.no_grad()
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the action for ``"observation"`` of any leading shape."""
-        seen = tensordict.get("observation")
-        greedy = exploration_type() == ExplorationType.DETERMINISTIC
-        out = self.agent.act(seen.to(self.agent.device), greedy=greedy)
-        for key, value in zip(self.out_keys, out, strict=True):
-            tensordict.set(key, value.to(seen.device))
-        return tensordict
 
 
 class LossActor(TensorDictModuleBase):

@@ -14,30 +14,33 @@ from giril_rl.networks.policy import ActorCritic
 from giril_rl.training.recorded import record
 
 
-def collecting(agent: Agent) -> TensorDictModuleBase:
+def collecting(agent: Agent, *, compile: bool = False) -> TensorDictModuleBase:
     """The module that acts while training: always samples, shares the agent's parameters.
 
     Args:
         agent: where its weights are for good; its networks run there.
+        compile: see :class:`RecordedActing`.
 
     Returns:
-        :class:`RecordedActing` for vectors on a CPU, where Python takes longer than the network;
-        the agent's own acting policy otherwise.
+        :class:`RecordedActing` where it is compiled, and for vectors on a CPU, where Python takes
+        longer than the network; the agent's own acting policy otherwise.
     """
-    if isinstance(agent, ActorCritic) and agent.device.type == "cpu":
-        return RecordedActing(agent)
+    if compile or (isinstance(agent, ActorCritic) and agent.device.type == "cpu"):
+        return RecordedActing(agent, compile=compile)
     return agent.acting()
 
 
 class RecordedActing(TensorDictModuleBase):
-    """:class:`giril_rl.networks.policy.ActingPolicy` as one recorded graph; it always samples.
+    """:class:`giril_rl.networks.acting.ActingPolicy` as one recorded graph; it always samples.
 
     The same numbers from the same random ones, bit for bit, in some 60% of the time, which makes
     training on a simulator of tens of microseconds some 4% faster. Weights and statistics may
     change in place, as an optimizer and ``load_state_dict`` change them, but not be replaced.
 
     Args:
-        agent: policy and value network of vectors.
+        agent: policy and value network.
+        compile: compiles the graph, see :func:`giril_rl.training.compiled.compiled`; the numbers
+            are then those to rounding, and drawn otherwise.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -47,12 +50,12 @@ class RecordedActing(TensorDictModuleBase):
         torch.Size([3])
     """
 
-    def __init__(self, agent: ActorCritic) -> None:
+    def __init__(self, agent: Agent, *, compile: bool = False) -> None:
         super().__init__()
-        acting = agent.acting()
-        self.in_keys = acting.in_keys
-        self.out_keys = acting.out_keys
+        self.in_keys = ["observation"]
+        self.out_keys = list(agent.acting_keys)
         self._act = _Act(agent)
+        self._compile = compile
         self._graph: Callable[..., tuple[Tensor, ...]] | None = None
         self._shape = torch.Size()
         self._state: list[Tensor] = []
@@ -60,12 +63,13 @@ class RecordedActing(TensorDictModuleBase):
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the action for ``"observation"``; another shape of it is recorded anew."""
-        observation = tensordict.get("observation")
+        seen = tensordict.get("observation")
+        observation = seen.to(self._act.agent.device)
         if self._graph is None or observation.shape != self._shape:
             self._graph = self._record(observation)
         out = self._graph(observation, *self._state)
         for key, value in zip(self.out_keys, out, strict=True):
-            tensordict.set(key, value)
+            tensordict.set(key, value.to(seen.device))
         return tensordict
 
     def _record(self, observation: Tensor) -> Callable[..., tuple[Tensor, ...]]:
@@ -77,13 +81,13 @@ class RecordedActing(TensorDictModuleBase):
             given = dict(zip(named, state, strict=True))
             return torch.func.functional_call(self._act, given, (seen,))
 
-        return record(act, [observation, *self._state])
+        return record(act, [observation, *self._state], compile=self._compile)
 
 
 class _Act(nn.Module):
     """:meth:`ActorCritic.act` as the call of a module, whose state can be given to it."""
 
-    def __init__(self, agent: ActorCritic) -> None:
+    def __init__(self, agent: Agent) -> None:
         super().__init__()
         self.agent = agent
 

@@ -105,7 +105,7 @@ def train_ppo(
     batch_size = cfg.num_envs * cfg.rollout
     collector = Collector(
         env,
-        collecting(agent),
+        collecting(agent, compile=cfg.compile),
         frames_per_batch=batch_size,
         total_frames=steps - taken,
         track_traj_ids=False,

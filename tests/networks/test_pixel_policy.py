@@ -113,7 +113,7 @@ def test_deterministic_mode_is_the_most_likely_action(agent):
     assert torch.equal(agent.actor_for_loss()(data)["action"], actions)
 
 
-def minibatch(agent, size=6):
+def minibatch(agent, size=30):
     data = agent.acting()(observe(size))
     data["dealt"] = agent.actor.deal(data["observation"])
     data["action_log_prob"] += 0.2 * torch.randn(size)  # some ratios are clipped, some are not

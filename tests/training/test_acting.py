@@ -1,10 +1,12 @@
 import pytest
 import torch
+from compiler import needs_compiler
 from tensordict import TensorDict
 from torchrl.data import Bounded, Categorical
 
+from giril_rl.networks.acting import ActingPolicy
 from giril_rl.networks.pixel_policy import PixelActorCritic
-from giril_rl.networks.policy import ActingPolicy, ActorCritic
+from giril_rl.networks.policy import ActorCritic
 from giril_rl.training.acting import RecordedActing, collecting
 
 SPECS = {"box": Bounded(-1, 1, shape=(8, 2)), "discrete": Categorical(3, shape=(8,))}
@@ -72,6 +74,29 @@ def test_a_state_dict_loaded_later_is_acted_on(agent):
     )
 
 
-def test_networks_of_pixels_are_called_as_they_are():
-    assert not isinstance(collecting(PixelActorCritic(3)), RecordedActing)
+def test_networks_of_pixels_are_called_as_they_are_unless_compiled():
+    assert isinstance(collecting(PixelActorCritic(3)), ActingPolicy)
+    assert isinstance(collecting(PixelActorCritic(3), compile=True), RecordedActing)
     assert isinstance(collecting(ActorCritic(4, SPECS["box"])), RecordedActing)
+
+
+@needs_compiler
+def test_compiled_it_acts_by_the_same_probabilities_and_values():
+    agent = PixelActorCritic(3)
+    with torch.no_grad():
+        agent.actor.head.weight.mul_(100)  # Far from uniform.
+    policy = RecordedActing(agent, compile=True)
+    frames = torch.randint(256, (4, 4, 84, 84), dtype=torch.uint8)
+    seen = set()
+    for seed in range(30):
+        if seed == 20:
+            with torch.no_grad():
+                agent.actor.head.bias.copy_(torch.tensor([0.0, 2.0, 0.0]))
+        acted = act(policy, frames, seed)
+        distribution, value = agent.distribution_and_value(frames)
+        expected = distribution.log_prob(acted["action"])
+        torch.testing.assert_close(acted["action_log_prob"], expected, rtol=1e-4, atol=1e-5)
+        torch.testing.assert_close(acted["state_value"], value, rtol=1e-4, atol=1e-5)
+        seen.add(tuple(acted["action"].tolist()))
+    assert len(seen) > 5
+    assert torch.equal(act(policy, frames, 7)["action"], act(policy, frames, 7)["action"])

@@ -1,14 +1,13 @@
 """``compile=true``: the same gradient steps, by torch's compiler."""
 
 import copy
-import os
-import shutil
 import signal
 import subprocess
 import sys
 
 import pytest
 import torch
+from compiler import needs_compiler
 from frame_losses import CASES
 from tensordict import TensorDict
 from torch import nn
@@ -20,11 +19,6 @@ from giril_rl.training.compiled import compiled
 from giril_rl.training.traced import TracedGradients
 
 ROWS = 6
-
-
-needs_compiler = pytest.mark.skipif(
-    shutil.which(os.environ.get("CXX", "g++")) is None, reason="there is no C++ compiler here"
-)
 
 
 class Autoencoder(nn.Module):
