@@ -16,9 +16,10 @@ _OWN_PLACE = {"task", "task.name", "seed"}
 NO_EFFECT = frozenset(
     {"out", "root", "logger", "threads", "device", "ppo.compile", "fit.compile", "reward.compile"}
 )
-"""Keys that change where and how fast a run is made, and not what it computes.
+"""Keys that change where and how fast a run is made, and not what it is a run of.
 
-Rounding may differ, and on another device or compiled a reward model's noise.
+On another device, or compiled, rounding differs and random numbers are others, of the same
+distribution.
 """
 _LONGEST = 80
 ADDED = {
