@@ -114,15 +114,15 @@ def _check_normalise(config: Any) -> None:
                 f"{part.name}.normalise={rule} does not fit the observations of "
                 f"{config.task.name}: set {part.name}.normalise={right}."
             )
-
-
-def _check_layers(config: RunConfig) -> None:
-    """The networks of frames are the paper's: what changes those of vectors would do nothing."""
-    if config.ppo.normalise_observations:
+    if config.task.is_atari and config.ppo.normalise_observations:
         raise UserError(
             f"ppo.normalise_observations=true is for vectors, and {config.task.name} has frames, "
             "which are divided by 255: leave it out."
         )
+
+
+def _check_layers(config: RunConfig) -> None:
+    """The networks of frames are the paper's: what would change those of vectors has no effect."""
     for part in fields(config):
         value = getattr(config, part.name)
         for name in ("hidden", "model_hidden"):

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
 from torchrl.envs.utils import ExplorationType, exploration_type
 
 if TYPE_CHECKING:
@@ -41,8 +42,12 @@ class ActingPolicy(TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the action for ``"observation"`` of any leading shape."""
         seen = tensordict.get("observation")
-        greedy = exploration_type() == ExplorationType.DETERMINISTIC
-        out = self.agent.act(seen.to(self.agent.device), greedy=greedy)
+        out = self.act(seen.to(self.agent.device))
         for key, value in zip(self.out_keys, out, strict=True):
             tensordict.set(key, value.to(seen.device))
         return tensordict
+
+    def act(self, observation: Tensor) -> tuple[Tensor, ...]:
+        """What is written for observations that are where the weights are."""
+        greedy = exploration_type() == ExplorationType.DETERMINISTIC
+        return self.agent.act(observation, greedy=greedy)

@@ -5,16 +5,15 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import torch
-from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
+from giril_rl.networks.acting import ActingPolicy
 from giril_rl.networks.agents import Agent
 from giril_rl.networks.policy import ActorCritic
 from giril_rl.training.recorded import record
 
 
-def collecting(agent: Agent, *, compile: bool = False) -> TensorDictModuleBase:
+def collecting(agent: Agent, *, compile: bool = False) -> ActingPolicy:
     """The module that acts while training: always samples, shares the agent's parameters.
 
     Args:
@@ -30,8 +29,8 @@ def collecting(agent: Agent, *, compile: bool = False) -> TensorDictModuleBase:
     return agent.acting()
 
 
-class RecordedActing(TensorDictModuleBase):
-    """:class:`giril_rl.networks.acting.ActingPolicy` as one recorded graph; it always samples.
+class RecordedActing(ActingPolicy):
+    """An :class:`~giril_rl.networks.acting.ActingPolicy` as one recorded graph; it always samples.
 
     The same numbers from the same random ones, bit for bit, in some 60% of the time, which makes
     training on a simulator of tens of microseconds some 4% faster. Weights and statistics may
@@ -51,26 +50,18 @@ class RecordedActing(TensorDictModuleBase):
     """
 
     def __init__(self, agent: Agent, *, compile: bool = False) -> None:
-        super().__init__()
-        self.in_keys = ["observation"]
-        self.out_keys = list(agent.acting_keys)
+        super().__init__(agent)
         self._act = _Act(agent)
         self._compile = compile
         self._graph: Callable[..., tuple[Tensor, ...]] | None = None
         self._shape = torch.Size()
         self._state: list[Tensor] = []
 
-    @torch.no_grad()
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the action for ``"observation"``; another shape of it is recorded anew."""
-        seen = tensordict.get("observation")
-        observation = seen.to(self._act.agent.device)
+    def act(self, observation: Tensor) -> tuple[Tensor, ...]:
+        """A draw for the observations; another shape of them is recorded anew."""
         if self._graph is None or observation.shape != self._shape:
             self._graph = self._record(observation)
-        out = self._graph(observation, *self._state)
-        for key, value in zip(self.out_keys, out, strict=True):
-            tensordict.set(key, value.to(seen.device))
-        return tensordict
+        return self._graph(observation, *self._state)
 
     def _record(self, observation: Tensor) -> Callable[..., tuple[Tensor, ...]]:
         named = {**dict(self._act.named_parameters()), **dict(self._act.named_buffers())}

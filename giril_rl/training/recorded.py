@@ -45,11 +45,11 @@ def record(
         graph = make_fx(function)(*inputs)
         graph.graph.eliminate_dead_code()
         graph.recompile()
-        # On a CPU TorchScript runs the graph as it is; for a GPU it would compile parts of it anew.
         device = inputs[0].device
         if compile:
             recorded = compiled(graph, device)
         elif device.type == "cpu":
+            # TorchScript runs the graph as it is; for a GPU it would compile parts of it anew.
             recorded = torch.jit.trace(graph, tuple(inputs), check_trace=False)
         else:
             recorded = graph

@@ -5,13 +5,6 @@ from torch.distributions import Categorical, Independent, Normal
 from giril_rl.networks.distributions import CategoricalActions, DiagonalGaussian
 
 
-@pytest.fixture(autouse=True)
-def seeded():
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(0)
-        yield
-
-
 def gaussian(*batch, size=3):
     mean = torch.randn(*batch, size, requires_grad=True)
     log_std = (0.5 * torch.randn(size)).requires_grad_()

@@ -51,13 +51,6 @@ def gradients_of(module, **settings):
     return TracedGradients(module, keys=["x", "y"], log=["code"], **settings)
 
 
-@pytest.fixture(autouse=True)
-def seeded():
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(0)
-        yield
-
-
 @needs_compiler
 @pytest.mark.parametrize("bound", [None, 0.1])
 def test_ten_steps_are_those_without_it(bound):

@@ -78,13 +78,6 @@ class Generative:
         return TensorDict({**entries, "next": {"observation": following}}, [size])
 
 
-@pytest.fixture(autouse=True)
-def seeded():
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(0)
-        yield
-
-
 @pytest.fixture(params=[PPO, Generative])
 def case(request):
     return request.param
