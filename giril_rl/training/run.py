@@ -18,6 +18,7 @@ from giril_rl.formats import RUN_FORMAT, check_run_format
 from giril_rl.naming import NO_EFFECT, without_added
 from giril_rl.places import cannot_write, check_place
 from giril_rl.schema import flat
+from giril_rl.sources import sources_of
 from giril_rl.training.checkpoint import load_state, save_state
 from giril_rl.training.metrics import METRICS, MetricsFile, check_logger, make_logger
 from giril_rl.untrusted import parse_yaml, read_text
@@ -29,7 +30,8 @@ class Run:
     ========================  ====================================================================
     ``config.yaml``           the resolved configuration, with the recipe's name
     ``versions.json``         the format of the folder, Python and the packages that decide the
-                              numbers
+                              numbers, and digests of the user's own code, see
+                              :mod:`giril_rl.sources`
     ``metrics.jsonl``         measurements, one JSON object a line
     ``NAME.safetensors``      checkpoints, see :func:`giril_rl.training.checkpoint.save_state`
     ``result.json``           written last; where it is, the run is finished
@@ -221,6 +223,8 @@ class Run:
                 f"{self.folder} was made with other settings ({'; '.join(differences[:3])}{more}): "
                 "choose another out=, or delete the folder."
             )
+        if before != config and not self.finished:  # It goes on with these.
+            write_atomically(path, yaml.safe_dump(config, sort_keys=False))
 
     def _check_checkpoints(self) -> None:
         """A damaged one is refused now, not when its part's turn has come."""
@@ -233,6 +237,8 @@ class Run:
         if self.finished and path.exists():
             return  # What is only looked at was not made with these versions.
         before = read_json(path) if path.exists() else self.versions
+        known = before.get("sources")
+        sources = {**(known if isinstance(known, dict) else {}), **sources_of(self.folder)}
         for name, now in self.versions.items():
             if before.get(name) != now:
                 warnings.warn(
@@ -240,7 +246,8 @@ class Run:
                     f"{now}: its numbers may not repeat.",
                     stacklevel=4,
                 )
-        write_json(path, {"format_version": RUN_FORMAT, **self.versions})
+        content = {"format_version": RUN_FORMAT, **self.versions}
+        write_json(path, {**content, "sources": sources} if sources else content)
 
 
 def _differences(
