@@ -80,8 +80,8 @@ def _spec(task: TaskConfig) -> gymnasium.envs.registration.EnvSpec:
     module, env_id = split_id(task.env_id)
     if module is not None and module not in sys.modules:
         raise UserError(
-            f"task.env_id={task.env_id} is of the module {module}, which is not imported: name it, "
-            f"with imports=[{module}] or --import {module}, or import it."
+            f"task.env_id={task.env_id} is not a Gymnasium id here: its module {module} is not "
+            f"imported; name it with imports=[{module}] or --import {module}, or import it."
         )
     try:
         return gymnasium.spec(env_id)
