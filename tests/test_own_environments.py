@@ -17,9 +17,24 @@ from giril_rl.study.spec import read_spec
 
 MODULE = """
 import gymnasium
-from conftest import StepCounter
+import numpy as np
 
-gymnasium.register("Own-v0", entry_point=lambda: StepCounter(5), max_episode_steps=20)
+
+class Own(gymnasium.Env):
+    observation_space = gymnasium.spaces.Box(-9, 9, (2,))
+    action_space = gymnasium.spaces.Box(-1, 1, (1,))
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.steps = 0
+        return np.zeros(2, np.float32), {}
+
+    def step(self, action):
+        self.steps += 1
+        return np.full(2, self.steps, np.float32), 1.0, self.steps == 5, False, {}
+
+
+gymnasium.register("Own-v0", entry_point=Own, max_episode_steps=20)
 """
 TINY = ["ppo.num_envs=2", "ppo.rollout=8", "ppo.minibatch=8", "ppo.epochs=1", "ppo.hidden=[4]"]
 TINY += ["steps=16", "eval.episodes=2", "logger=null"]
@@ -84,8 +99,7 @@ def test_a_copied_recipe_finds_what_lies_beside_it(own, tmp_path, monkeypatch):
     "words", [["--env-id", "own_envs:Own-v0"], ["--env-id", "Own-v0", "--import", "own_envs"]]
 )
 def test_its_demonstrations_are_imported(own, words):
-    observations = np.zeros((6, 3), np.float32)
-    observations[:, 1] = range(6)
+    observations = np.repeat(np.arange(6, dtype=np.float32)[:, None], 2, axis=1)
     actions = np.zeros((5, 1), np.float32)
     np.savez("own.npz", observations=observations, actions=actions, lengths=[5], terminated=[True])
     assert main(["demo", "import", "own.npz", "--out", "demo", *words]) == 0

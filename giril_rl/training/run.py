@@ -110,8 +110,9 @@ class Run:
         try:
             for leftover in run.folder.glob(".*.tmp"):
                 leftover.unlink()
-            run._write_or_compare_config(ignore)
+            run._compare_config(ignore)
             run._check_checkpoints()
+            run._write_config()
             run._write_versions()
             run._metrics = MetricsFile(run.folder / METRICS)
         except BaseException:
@@ -203,12 +204,13 @@ class Run:
                 "choose another out=."
             )
 
-    def _write_or_compare_config(self, ignore: Collection[str]) -> None:
-        path = self.folder / "config.yaml"
+    def _written_config(self) -> dict[str, Any]:
         # Through JSON, so that tuples and lists compare equal, as they do once written.
-        config = json.loads(json.dumps({"recipe": self.recipe, **self.config}))
+        return json.loads(json.dumps({"recipe": self.recipe, **self.config}))
+
+    def _compare_config(self, ignore: Collection[str]) -> None:
+        path = self.folder / "config.yaml"
         if not path.exists():
-            write_atomically(path, yaml.safe_dump(config, sort_keys=False))
             return
         try:
             before = parse_yaml(read_text(path))
@@ -216,14 +218,19 @@ class Run:
             before = None
         if not isinstance(before, dict):
             raise UserError(f"{path} cannot be read: choose another out=, or delete the folder.")
-        differences = _differences(before, config, ignore)
+        differences = _differences(before, self._written_config(), ignore)
         if differences:
             more = f" and {len(differences) - 3} more" if len(differences) > 3 else ""
             raise UserError(
                 f"{self.folder} was made with other settings ({'; '.join(differences[:3])}{more}): "
                 "choose another out=, or delete the folder."
             )
-        if before != config and not self.finished:  # It goes on with these.
+
+    def _write_config(self) -> None:
+        """An unfinished run goes on with the settings of now, where they may differ."""
+        path = self.folder / "config.yaml"
+        config = self._written_config()
+        if not path.exists() or not (self.finished or parse_yaml(read_text(path)) == config):
             write_atomically(path, yaml.safe_dump(config, sort_keys=False))
 
     def _check_checkpoints(self) -> None:

@@ -26,8 +26,8 @@ def test_unknown_id_names_the_nearest():
         "task.env_id=not_imported:Ball-v0 is not a Gymnasium id here: its module not_imported is "
         "not imported; name it with imports=[not_imported] or --import not_imported, or import it."
     )
-    assert refused("conftest:Ball-v0") == (
-        "task.env_id=conftest:Ball-v0 is not a Gymnasium id that conftest registers: check its "
+    assert refused("gymnasium:Ball-v0") == (
+        "task.env_id=gymnasium:Ball-v0 is not a Gymnasium id that gymnasium registers: check its "
         "name."
     )
 
