@@ -27,6 +27,7 @@ from giril_rl.training.interrupt import Interrupt, Interrupted
 from giril_rl.training.restoring import restoring
 from giril_rl.training.threads import made_on_one_thread
 from giril_rl.training.traced import TracedGradients
+from giril_rl.transforms import BatchMeanReward
 
 if TYPE_CHECKING:
     from giril_rl.training.reward_learner import RewardLearner
@@ -38,10 +39,17 @@ NO_FAILURE = "no_failure"
 
 
 class Trained(NamedTuple):
-    """How long a training was."""
+    """What a training was.
+
+    Attributes:
+        steps: environment steps.
+        seconds: wall-clock seconds.
+        averaged: whether its rewards were averaged over the environments.
+    """
 
     steps: int
     seconds: float
+    averaged: bool = False
 
 
 def train_ppo(
@@ -92,6 +100,7 @@ def train_ppo(
     tracker = EpisodeTracker(cfg.num_envs)
     recent: deque[float] = deque(maxlen=20)
     parts = nn.ModuleDict({"agent": agent, "tracker": tracker, "relabel": relabel})
+    averaged = any(isinstance(part, BatchMeanReward) for part in relabel.modules())
     taken = 0
     saved = run.load(phase)
     if saved is not None:
@@ -100,7 +109,7 @@ def train_ppo(
             recent.extend(saved["recent"])
             if taken >= steps or saved["stopped"]:
                 parts.load_state_dict(saved["parts"])
-                return Trained(taken, saved["seconds"])
+                return Trained(taken, saved["seconds"], averaged)
             env.restore_simulator(saved["simulator"])
     batch_size = cfg.num_envs * cfg.rollout
     collector = Collector(
@@ -181,7 +190,7 @@ def train_ppo(
                 break
     if interrupt.requested:  # At the end as well, for the run may have more to do.
         raise Interrupted.at(taken, steps)
-    return Trained(taken, time.perf_counter() - began)
+    return Trained(taken, time.perf_counter() - began, averaged)
 
 
 class PPOLearner:
