@@ -20,7 +20,7 @@ from giril_rl.envs.stdout import silent_stdout
 from giril_rl.errors import UserError
 from giril_rl.files import installed_versions
 from giril_rl.progress import progress
-from giril_rl.randomness import seeded
+from giril_rl.randomness import seeded, stream_seed
 
 _LONGEST_EPISODE = 1_000_000
 
@@ -32,7 +32,7 @@ def episode_seed(seed: int, episode: int) -> int:
         >>> len({episode_seed(seed, episode) for seed in range(3) for episode in range(100)})
         300
     """
-    return int(np.random.SeedSequence([seed, episode]).generate_state(1)[0])
+    return stream_seed("demonstration", seed, episode, bits=32)
 
 
 def record_demonstration(
