@@ -70,7 +70,7 @@ class AtariGymEnv(gymnasium.Env):
 
 
 class _SeededAsRecorded(AtariEnv):
-    """A game whose emulator's seed depends on the given seed alone, as in every recording so far."""
+    """A game whose emulator is seeded by the given seed alone, as in every recording so far."""
 
     def _episode_seed(self, index: int) -> int:
         entropy = [self._root_seed, index, int(self._episode[index])]

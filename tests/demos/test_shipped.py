@@ -85,7 +85,7 @@ def test_the_runs_seed_chooses_and_they_are_taken_in_turn():
 
 def test_there_is_no_other_one():
     pong = TaskConfig(name="pong", env_id="ALE/Pong-v5")
-    with pytest.raises(UserError, match="pong is shipped: there are beam_rider, breakout, kung"):
+    with pytest.raises(UserError, match="pong is shipped: there are beam_rider, breakout, inv"):
         demonstration_folder("shipped", pong)
     with pytest.raises(UserError, match="did you mean 'breakout'"):
         demonstration_folder("shipped:breakou")
