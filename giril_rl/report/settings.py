@@ -98,8 +98,16 @@ def changes_of(runs: Sequence[RunRecord]) -> dict[str, Changes]:
             and _reads(run, key)
             and not (key in base and base[key] == value)
         }
+        # Asking for another player or recording is asking for none that is shipped.
+        if differing.get("demo.path") == "null" and any(map(_of_players, differing)):
+            del differing["demo.path"]
         found[run.name] = tuple(sorted(differing.items()))
     return found
+
+
+def _of_players(key: str) -> bool:
+    recorded = key.startswith("demo.") and key not in ("demo.path", "demo.subsample")
+    return recorded or key.startswith("expert.")
 
 
 def _reads(run: RunRecord, key: str) -> bool:

@@ -66,13 +66,13 @@ OPTIONAL: dict[str, Check] = {
     "steps_per_second": _or_none(_number),
     "expert_return_mean": _or_none(_number),
     "demo_return_mean": _or_none(_number),
-    "demo_transitions": _or_none(_natural),
-    "held_action": _natural,
-    "random_policy": _flag,
     "demo": _or_none(_word),
     "demo_id": _or_none(_word),
-    "versions": _mapping,
+    "demo_transitions": _or_none(_natural),
     "processor": _or_none(_word),
+    "held_action": _natural,
+    "random_policy": _flag,
+    "versions": _mapping,
 }
 """What runs of some kind, or of an earlier version, have not."""
 
