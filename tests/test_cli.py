@@ -186,12 +186,11 @@ def test_copy_runs_with_its_own_changed_default(capsys, fake, monkeypatch):
 
 
 def test_a_copy_whose_runs_would_have_another_recipes_name_is_refused(capsys, fake):
-    named = refused(capsys_cleared(capsys), "run", copied("gail.py", "giril"))
-    assert named == (
+    assert main(["cp", "giril", "gail.py"]) == main(["cp", "control", "mine.py"]) == 0
+    assert refused(capsys_cleared(capsys), "run", "gail.py") == (
         "gail.py has the name of the recipe gail, whose runs its own would be taken for: rename "
         "both files."
     )
-    copied("mine.py", "control")
     text = Path("mine.py").read_text()
     for new, instead in (
         ('Run.open(out, recipe="control")', "write recipe=Path(__file__).stem"),
@@ -203,11 +202,6 @@ def test_a_copy_whose_runs_would_have_another_recipes_name_is_refused(capsys, fa
             f"{Path('mine.py').resolve()}, line {line}: a run has the name of its recipe's file, "
             f"mine: {instead}."
         )
-
-
-def copied(file, recipe):
-    assert main(["cp", recipe, file]) == 0
-    return file
 
 
 def capsys_cleared(capsys):

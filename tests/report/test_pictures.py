@@ -11,6 +11,9 @@ from giril_rl.configs import DemoConfig, ExpertConfig, GenerativeConfig, PPOConf
 from giril_rl.demos import record_demonstration
 from giril_rl.envs import gym_factory, make_env
 from giril_rl.naming import config_hash
+from giril_rl.report.pictures import _is_generative
+from giril_rl.report.rows import panels_of
+from giril_rl.report.runs import read_runs
 from giril_rl.rewards import GenerativeReward
 from giril_rl.training import make_agent
 from giril_rl.training.expert import demonstration_place, expert_settings
@@ -112,3 +115,15 @@ def test_vectors_have_no_pictures(made, capsys):
     made("giril", score=1.0)
     section, pictures = report(made, capsys)
     assert not section and not pictures
+
+
+def test_of_recipes_of_ones_own_those_with_a_generative_model_have_pictures(run, made):
+    for recipe in ("giril", "cdil"):
+        folder = run("giril") if recipe == "giril" else made(recipe, *WORDS, score=1.0)
+        config = folder / "config.yaml"
+        config.write_text(config.read_text().replace(f"recipe: {recipe}", f"recipe: my_{recipe}"))
+    (panel,) = panels_of(read_runs(made.root)[0])
+    assert {row.method: _is_generative(row) for row in panel.rows} == {
+        "my_cdil": False,
+        "my_giril": True,
+    }
