@@ -79,7 +79,7 @@ class FixedHorizonEnv(GymVectorEnv):
                 "an environment without a time limit has no fixed horizon: "
                 "set task.max_episode_steps."
             )
-        self._resets = after_failure == "reset"
+        self._failure_ends = after_failure == "reset"
         self._played = np.zeros(num_envs, dtype=np.int64)
         self._failed = np.zeros(num_envs, dtype=bool)
 
@@ -98,7 +98,7 @@ class FixedHorizonEnv(GymVectorEnv):
         failed = after.get("terminated").view(-1).numpy()
         self._failed |= failed
         following = after.get("observation")
-        if self._resets and failed.any():
+        if self._failure_ends and failed.any():
             following = torch.from_numpy(self._restart(failed))
         after.set("following_observation", following)
         after.set("scored", scored)

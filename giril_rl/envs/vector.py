@@ -12,7 +12,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Bounded, Unbounded
 
-from giril_rl.envs.batched import NOT_REPEATING, BatchedEnv
+from giril_rl.envs.batched import BatchedEnv
 from giril_rl.envs.saved import check_actions, check_counts, saved_array, saved_seed, saved_tensor
 from giril_rl.envs.spaces import action_spec, without_bookkeeping
 from giril_rl.envs.stdout import silent_stdout
@@ -54,6 +54,9 @@ class GymVectorEnv(BatchedEnv):
         >>> env.rollout(10, break_when_any_done=False)["next", "observation"].shape
         torch.Size([4, 10, 4])
     """
+
+    _failure_ends = True
+    """Whether a simulator is reset when it fails."""
 
     def __init__(
         self,
@@ -160,16 +163,18 @@ class GymVectorEnv(BatchedEnv):
             "observation": torch.from_numpy(self._last_observation.copy()),
         }
 
-    def restore_simulator(self, state: dict[str, Any]) -> None:
+    def restore_simulator(self, state: dict[str, Any]) -> bool:
         """Replays the running episodes; the next :meth:`reset` hands out where they stand.
 
         Args:
             state: what :meth:`simulator_state` returned for an equal environment.
 
+        Returns:
+            Whether the replay came to the same moment. If not, the simulator does not repeat itself
+            for the same seed and actions, and all copies begin their next episodes.
+
         Raises:
             ValueError: if it is no state of such an environment; nothing is played then.
-            UserError: if the replay ends elsewhere, which means that the simulator does not
-                repeat itself for the same seed and actions.
         """
         saved = saved_array(state, "observation", self._last_observation)
         self._root_seed = saved_seed(state)
@@ -184,18 +189,31 @@ class GymVectorEnv(BatchedEnv):
             count = getattr(self.action_spec.space, "n", None)
             check_actions(actions, self.action_spec.shape, self._bounds, count)
         self._actions = list(actions) if steps.max() else []
-        observation = np.empty_like(self._last_observation)
         with silent_stdout():
-            for i, env in enumerate(self._gym_envs):
-                self._episode[i] -= 1
-                observation[i], _ = env.reset(seed=self._episode_seed(i))
-                self._episode[i] += 1
-                for action in actions[len(actions) - steps[i] :]:
-                    observation[i] = env.step(action[i])[0]
-        if not np.array_equal(observation, saved):
-            raise UserError(NOT_REPEATING)
-        self._last_observation = observation
+            shown = [self._replay(i, actions[len(actions) - steps[i] :]) for i in range(len(saved))]
         self._started = self._restored = True
+        self._last_observation = saved
+        if all(
+            one is not None and np.array_equal(one, other)
+            for one, other in zip(shown, saved, strict=True)
+        ):
+            return True
+        self._reset_where(np.ones(len(saved), dtype=bool))
+        return False
+
+    def _replay(self, i: int, actions: np.ndarray) -> np.ndarray | None:
+        """What copy ``i`` shows after its ``actions``; None if its episode ended before them."""
+        env = self._gym_envs[i]
+        self._episode[i] -= 1
+        observation, _ = env.reset(seed=self._episode_seed(i))
+        self._episode[i] += 1
+        over = False
+        for action in actions:
+            if over:
+                return None
+            observation, _, failed, cut, _ = env.step(action[i])
+            over = cut or (failed and self._failure_ends)
+        return np.asarray(observation, dtype=np.float32)
 
     def _restore_clocks(self, state: dict[str, Any]) -> None:
         """Takes what a subclass added to :meth:`simulator_state`."""

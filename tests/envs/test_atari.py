@@ -283,7 +283,7 @@ def test_a_restored_env_goes_on_as_the_first_would_have(episode, cap, monkeypatc
     state = first.simulator_state()
     assert all(isinstance(value, (int, torch.Tensor)) for value in state.values())
     second = AtariEnv("breakout", 3, episode=episode, seed=99, frame_cap=cap)
-    second.restore_simulator(state)
+    assert second.restore_simulator(state)
     roots = [first._root(torch.from_numpy(first._last_observation.copy())), second.reset()]
     generator = torch.Generator().manual_seed(7)
     ended = 0
@@ -299,13 +299,30 @@ def test_a_restored_env_goes_on_as_the_first_would_have(episode, cap, monkeypatc
     assert ended > 3
 
 
-def test_a_replay_that_ends_elsewhere_is_refused():
-    env = AtariEnv("breakout", 1)
+def test_a_replay_that_ends_elsewhere_begins_the_next_games():
+    env = AtariEnv("breakout", 2, seed=3)
     play(env, 20)
     state = env.simulator_state()
     state["actions"] = state["actions"].clone().fill_(3)
-    with pytest.raises(UserError, match="does not repeat itself"):
-        AtariEnv("breakout", 1).restore_simulator(state)
+    other = AtariEnv("breakout", 2)
+    assert not other.restore_simulator(state)
+    env._between[:] = False
+    assert torch.equal(other.reset()["observation"], env.reset()["observation"])
+    assert torch.equal(other.simulator_state()["episode"], state["episode"] + 1)
+
+
+def test_a_replay_stops_where_a_game_ends_too_early(monkeypatch):
+    env = AtariEnv("breakout", 1)
+    play(env, 20)
+    receive, received = AtariGame.receive, []
+
+    def over_at_once(game):
+        received.append(receive(game))
+        return received[-1]._replace(over=len(received) == 1)
+
+    monkeypatch.setattr(AtariGame, "receive", over_at_once)
+    assert not AtariEnv("breakout", 1).restore_simulator(env.simulator_state())
+    assert len(received) == 1 + 2  # The rest is the next game's opening.
 
 
 @pytest.fixture(scope="module")

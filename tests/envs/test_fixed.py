@@ -185,7 +185,7 @@ def test_a_restored_simulator_continues_bit_for_bit(env_id, limit, after_failure
 
     state = load_state(tmp_path / "state")
     fresh = make_env(settings, 3, seed=99)
-    fresh.restore_simulator(state)
+    assert fresh.restore_simulator(state)
     again = fresh.simulator_state()
     for key, value in state.items():
         assert np.array_equal(again[key], value), key
