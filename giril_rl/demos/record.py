@@ -20,7 +20,7 @@ from giril_rl.envs.checking import check_reset, check_step, env_name
 from giril_rl.envs.spaces import check_action_space
 from giril_rl.envs.stdout import silent_stdout
 from giril_rl.errors import UserError
-from giril_rl.files import installed_versions
+from giril_rl.files import installed_versions, processor
 from giril_rl.progress import progress
 from giril_rl.randomness import seeded, stream_seed
 
@@ -74,7 +74,8 @@ def record_demonstration(
 
     Returns:
         The demonstration; its card has ``task``, ``env_id``, ``seed``, ``seeds``, ``length``,
-        ``deterministic``, ``expert``, ``versions``, ``transitions`` and ``episode_returns``, a
+        ``deterministic``, ``expert``, ``versions``, ``processor``, ``transitions`` and
+        ``episode_returns``, a
         game's also ``lives``, ``lives_left`` (at each episode's beginning and end) and ``actions``,
         their names.
 
@@ -136,6 +137,7 @@ def record_demonstration(
         "deterministic": deterministic,
         "expert": expert,
         "versions": installed_versions(),
+        "processor": processor(),
         "transitions": len(demo),
         "episode_returns": demo.returns.tolist(),
     }
