@@ -24,7 +24,7 @@ from giril_rl.demos.task import as_recorded_task, check_environment, spaces_of
 from giril_rl.envs import gym_factory, make_env, with_own_episodes
 from giril_rl.errors import UserError
 from giril_rl.files import remove_leftovers
-from giril_rl.naming import out_folder, safe, without_added
+from giril_rl.naming import NO_EFFECT, out_folder, safe, without_added
 from giril_rl.networks.agents import Agent
 from giril_rl.randomness import check_device
 from giril_rl.shipped import demonstration_folder
@@ -221,7 +221,7 @@ def _identity(task: TaskConfig, demo: DemoConfig, expert: str) -> str:
     """Twelve hex digits of what decides a demonstration."""
     unread = {"path", "subsample"} | (set() if task.is_atari else {"lives"})
     chosen = {key: value for key, value in asdict(demo).items() if key not in unread}
-    parts = without_added({"demo": chosen, "task": asdict(task)})
+    parts = without_added({"demo": chosen, "task": asdict(task)}, drop=NO_EFFECT)
     identity = json.dumps([parts["demo"], parts["task"], expert], sort_keys=True)
     return hashlib.sha256(identity.encode()).hexdigest()[:12]
 
