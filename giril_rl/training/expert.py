@@ -31,6 +31,7 @@ from giril_rl.shipped import demonstration_folder
 from giril_rl.task_defaults import apply_task_defaults
 from giril_rl.training.agent import load_agent, make_agent
 from giril_rl.training.finished import read_result
+from giril_rl.training.outlook import announce
 from giril_rl.training.ppo import train_ppo
 from giril_rl.training.result import finish_run
 from giril_rl.training.run import Run
@@ -166,6 +167,9 @@ def obtain_demonstration(
     Raises:
         UserError: if the demonstration does not fit the task.
     """
+    settings = expert_settings(cfg, expert)
+    has_player = (out_folder("expert", settings, {}) / "result.json").exists()
+    announce(cfg, expert, demo, has_player=has_player)
     if demo.path is not None:
         given = _given_demonstration(cfg, demo.path)
         return given, _known_expert(given)
