@@ -16,6 +16,7 @@ from giril_rl.configs import TaskConfig
 from giril_rl.demos import record_demonstration
 from giril_rl.envs import GymVectorEnv, make_env
 from giril_rl.errors import UserError
+from giril_rl.randomness import stream_seed
 from giril_rl.rewards.actions import ActionEncoder
 from giril_rl.training.checkpoint import load_state, save_state
 
@@ -51,8 +52,7 @@ def gymnasium_loop(make_fn, actions, seed):
     columns = {key: [] for key in KEYS}
     for i in range(actions.shape[1]):
         env = make_fn()
-        sequences = (np.random.SeedSequence([seed, i, episode]) for episode in itertools.count())
-        seeds = (int(sequence.generate_state(1)[0]) for sequence in sequences)
+        seeds = (stream_seed("training", seed, i, n, bits=32) for n in itertools.count())
         observation = env.reset(seed=next(seeds))[0].copy()
         rows = {key: [] for key in KEYS}
         for action in actions[:, i].numpy():
