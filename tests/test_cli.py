@@ -195,8 +195,8 @@ def test_a_copy_whose_runs_would_have_another_recipes_name_is_refused(capsys, fa
     Path("mine.py").write_text(text.replace("recipe=Path(__file__).stem", 'recipe="control"'))
     line = text[: text.index("recipe=Path")].count("\n") + 1
     assert refused(capsys, "run", "mine.py") == (
-        f"{Path('mine.py').resolve()}, line {line}: its runs would be called 'control', not 'mine' as "
-        "the file: write recipe=Path(__file__).stem."
+        f"{Path('mine.py').resolve()}, line {line}: its runs would be called 'control', not "
+        "'mine' as the file: write recipe=Path(__file__).stem."
     )
 
 
