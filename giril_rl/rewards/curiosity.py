@@ -32,11 +32,15 @@ def feature_error(predicted: Tensor, features: Tensor) -> Tensor:
         predicted: the forward model's ``phi_hat(s')``, ``(*batch, features)``.
         features: ``phi(s')``, of the same shape.
 
+    Raises:
+        UserError: if it is of another shape.
+
     Examples:
         >>> import torch
         >>> feature_error(torch.tensor([[0.5, 1.0]]), torch.tensor([[0.5, -1.0]]))
         tensor([4.])
     """
+    check_output("the forward model", predicted, features.shape)
     return (predicted - features).square().sum(-1)
 
 
@@ -202,9 +206,7 @@ class CuriosityReward(Pretrained, TensorDictModuleBase):
 
     def predict(self, features: Tensor, action_code: Tensor) -> Tensor:
         """``phi_hat(s')`` from ``phi(s)`` and the action's code."""
-        predicted = self.forward_model(features, action_code)
-        check_output("the forward model", predicted, features.shape)
-        return predicted
+        return self.forward_model(features, action_code)
 
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
