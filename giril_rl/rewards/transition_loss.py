@@ -35,7 +35,7 @@ class TransitionLoss(LossModule):
             loss's ``state_dict`` are the module's, its noise generator's included.
 
     Raises:
-        UserError: for an unknown reduction.
+        UserError: for an unknown reduction, or entries that are missing.
 
     Examples:
         >>> from torchrl.data import Bounded
