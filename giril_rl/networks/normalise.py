@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from giril_rl.errors import UserError
+
 
 class RunningNormaliser(nn.Module):
     """Subtracts the running mean, divides by the running standard deviation, clips.
@@ -56,7 +58,11 @@ class RunningNormaliser(nn.Module):
             observation: raw observations.
             least: smallest deviation to divide by. A good player hardly moves some of its
                 observations; divided by so little, what it never saw would be far out of range.
+
+        Raises:
+            UserError: for NaN or infinity; the statistics are then as they were.
         """
+        _check_finite(observation)
         batch = observation.reshape(-1, observation.shape[-1]).double()
         self.mean.copy_(batch.mean(0))
         self.var.copy_(batch.var(0, correction=0).clamp(min=least**2))
@@ -66,7 +72,12 @@ class RunningNormaliser(nn.Module):
 
     @torch.no_grad()
     def update(self, observation: Tensor) -> None:
-        """Merges ``(*batch, size)`` into the statistics (Chan et al. 1983)."""
+        """Merges ``(*batch, size)`` into the statistics (Chan et al. 1983).
+
+        Raises:
+            UserError: for NaN or infinity; the statistics are then as they were.
+        """
+        _check_finite(observation)
         batch = observation.reshape(-1, observation.shape[-1]).double()
         n = batch.shape[0]
         total = self.count + n
@@ -77,3 +88,14 @@ class RunningNormaliser(nn.Module):
         self.count.copy_(total)
         self.shift.copy_(self.mean)
         self.factor.copy_((self.var + self.eps).rsqrt())
+
+
+def _check_finite(observation: Tensor) -> None:
+    finite = observation.isfinite()
+    if not finite.all():
+        *where, entry = (~finite).nonzero()[0].tolist()
+        value = observation[(*where, entry)].item()
+        raise UserError(
+            f"an observation is not finite: {value} at entry {entry} of the one at {where} in the "
+            "batch, where running statistics would keep it for ever; mend the environment or data."
+        )

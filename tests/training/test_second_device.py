@@ -134,7 +134,7 @@ def test_training_a_discriminator(cls, loss, penalty, kind):
 def test_a_step_of_ppo(kind):
     agent = agent_for(kind)
     learner = PPOLearner(agent, PPOConfig(clip_value=True, entropy_coef=0.01), total_steps=8)
-    rows = {"action": transitions(kind, 8)["action"], agent.input_keys[0]: torch.randn(8, 3)}
+    rows = {agent.drawn_key: transitions(kind, 8)["action"], agent.input_keys[0]: torch.randn(8, 3)}
     if kind == "pixels":
         rows[agent.input_keys[0]] = agent.actor.deal(observations(kind, 8))
     scalars = ("advantage", "value_target", "state_value")
