@@ -172,7 +172,7 @@ class Pretrained:
             ) from None
         if written < made.card_format:
             raise UserError(
-                f"{path} has format {written}, of a {cls.__name__} that this giril_rl would run "
+                f"{path} has format {written}, of a policy or reward that this giril_rl would run "
                 "otherwise than it was trained: train it anew, or use the version that wrote it."
             )
         return made

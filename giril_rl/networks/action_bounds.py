@@ -58,10 +58,11 @@ def unsupported(spec: TensorSpec) -> UserError:
 
 
 class AffineMap(NamedTuple):
-    """Bounds of each action dimension, and the map ``offset + half_range * u`` from [-1, 1] to them.
+    """Bounds of each action dimension, and the map ``offset + half_range * u`` to them.
 
-    A dimension without two finite bounds keeps its unit: ``offset`` 0, ``half_range`` 1. All are float64
-    ``(size,)`` on the CPU; a missing bound is infinite.
+    It takes -1 and 1 to the bounds. A dimension without two finite bounds keeps its unit:
+    ``offset`` 0, ``half_range`` 1. All are float64 ``(size,)`` on the CPU; a missing bound is
+    infinite.
     """
 
     low: Tensor
@@ -103,9 +104,9 @@ def affine_map(spec: TensorSpec) -> AffineMap:
 class ActionBounds(nn.Module):
     """Maps what a policy draws to an action within the bounds.
 
-    A draw ``u`` becomes ``offset + half_range * u``, clamped to the bounds: -1 and 1 become the bounds
-    themselves. A dimension without two finite bounds keeps its unit, and is clamped to the one that
-    it has. The buffers follow from the spec and are not saved.
+    A draw ``u`` becomes ``offset + half_range * u``, clamped to the bounds: -1 and 1 become the
+    bounds themselves. A dimension without two finite bounds keeps its unit, and is clamped to the
+    one that it has. The buffers follow from the spec and are not saved.
 
     Args:
         affine: the map of a spec, see :func:`affine_map`.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor, nn
-from torchrl.data import Bounded, Categorical, OneHot, TensorSpec
+from torchrl.data import Categorical, OneHot, TensorSpec
 
 from giril_rl.networks.action_bounds import affine_map, single_action_spec
 

@@ -58,8 +58,8 @@ def clone_behaviour(
     Args:
         agent: the policy; its actor, normaliser and deviation are changed in place.
         fitted: pairs to fit, batch ``(n,)``, with ``"observation"`` (raw) and ``"action"`` as
-            executed: in the environment's units within the bounds of Box actions, integers or one-hot
-            vectors for Discrete ones.
+            executed: Box actions in the environment's units and within the bounds, Discrete ones as
+            integers or one-hot vectors.
         cfg: settings.
         seed: seeds the minibatches, where there are any.
         run: where metrics and checkpoints go.

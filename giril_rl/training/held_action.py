@@ -47,7 +47,9 @@ class HeldAction(TensorDictModuleBase):
         self.out_keys = ["action"]
         self.action = action
         one_hot = isinstance(single_action_spec(action_spec), OneHot)
-        self._written = torch.eye(count, dtype=torch.int64)[action] if one_hot else torch.tensor(action)
+        self._written = (
+            torch.eye(count, dtype=torch.int64)[action] if one_hot else torch.tensor(action)
+        )
 
     @classmethod
     def of_task(cls, task: TaskConfig, action: int) -> HeldAction:
