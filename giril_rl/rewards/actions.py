@@ -25,6 +25,7 @@ class ActionEncoder(nn.Module):
         UserError: for a spec of another kind.
 
     Examples:
+        >>> from torchrl.data import Bounded
         >>> ActionEncoder(Categorical(3))(torch.tensor([2, 0])).tolist()
         [[0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]
         >>> ActionEncoder(Bounded(0.0, 4.0, shape=(1,)))(torch.tensor([[3.0], [9.0]])).tolist()
