@@ -102,7 +102,8 @@ def test_the_numbers_written_are_those_that_are_promised():
     page = (DATA.parents[1] / "docs/stability.md").read_text()
     assert read_json(DATA / "run/versions.json")["format_version"] == 1
     assert "| run folder | 1 |" in page and "| demonstration | 1 of vectors, 2 of images |" in page
-    for name, number in {"demonstration": 1, "demonstration_of_images": 2, "run/policy": 1}.items():
+    numbers = {"run/policy": 1, "scaled_policy": 2}
+    for name, number in {"demonstration": 1, "demonstration_of_images": 2, **numbers}.items():
         assert read_json(DATA / name / "card.json")["format_version"] == number
 
 
