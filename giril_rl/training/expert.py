@@ -184,7 +184,7 @@ def obtain_demonstration(
                 episodes=demo.episodes,
                 deterministic=demo.deterministic,
                 task=task.name,
-                expert={"return_mean": result["return_mean"], "seed": result["seed"]},
+                expert={key: result[key] for key in ("return_mean", "seed", "env_steps")},
                 lives=demo.lives if task.is_atari else None,
             )
             recorded.save(folder)
