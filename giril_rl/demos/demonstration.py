@@ -24,8 +24,6 @@ FORMAT_VERSION = 1
 """Of vectors."""
 IMAGE_FORMAT_VERSION = 2
 """Of images, which lie in a file of their own."""
-_ROWS = 1024
-"""Transitions whose bytes are looked at together."""
 
 _AT_ONCE = 10_000
 _IMAGES: list[NestedKey] = ["observation", ("next", "observation")]
@@ -80,32 +78,6 @@ class Demonstration:
         return int(self.transitions["episode"].max()) + 1 if len(self) else 0
 
     @property
-    def demo_id(self) -> str:
-        """12 hex digits that tell its transitions from others, whatever the card says.
-
-        They are the beginning of a SHA-256 over all tensors: names, dtypes, shapes and numbers.
-        What was saved and loaded, or exported and imported, keeps its id. It is computed anew each
-        time.
-
-        Examples:
-            >>> zero = TensorDict({"observation": torch.zeros(3, 2)}, [3])
-            >>> Demonstration(zero).demo_id
-            '25b6f6b6ad74'
-            >>> Demonstration(zero, {"task": "other"}).demo_id == Demonstration(zero).demo_id
-            True
-            >>> Demonstration(zero + 1).demo_id == Demonstration(zero).demo_id
-            False
-        """
-        content = hashlib.sha256()
-        items = self.transitions.items(include_nested=True, leaves_only=True)
-        tensors = {key if isinstance(key, str) else ".".join(key): value for key, value in items}
-        for name, value in sorted(tensors.items()):
-            content.update(f"{name} {value.dtype} {list(value.shape)}\n".encode())
-            for part in value.split(_ROWS):
-                content.update(part.cpu().contiguous().view(-1).view(torch.uint8).numpy())
-        return content.hexdigest()[:12]
-
-    @property
     def returns(self) -> Tensor:
         """Undiscounted true return of each episode, float64 [num_episodes]."""
         rewards = self.transitions["next", "reward"].reshape(-1).double()
@@ -132,7 +104,7 @@ class Demonstration:
             values = self.transitions.get(key)
             digest.update(f"{key}{values.dtype}{tuple(values.shape)}".encode())
             for part in values.split(_AT_ONCE):
-                digest.update(part.contiguous().numpy())
+                digest.update(part.cpu().contiguous().numpy())
         return digest.hexdigest()[:12]
 
     def save(self, folder: Path | str) -> None:

@@ -23,7 +23,7 @@ def describe(demo: Demonstration) -> str:
         ... )
         >>> print(describe(demo))
         task         cartpole (CartPole-v1)
-        id           0c5898ca9d88
+        id           ...
         transitions  15
         episodes     2
         observation  4 numbers

@@ -49,18 +49,16 @@ def test_saved_again_after_loading(folder, tmp_path):
 
 
 def test_id_is_a_digest_of_all_tensors(demo, folder, monkeypatch):
-    names = ["action", "episode", "next.done", "next.observation", "next.reward"]
-    names += ["next.terminated", "next.truncated", "observation", "step"]
+    after = ("done", "observation", "reward", "terminated", "truncated")
     content = hashlib.sha256()
-    for name in names:
-        array = demo.transitions[tuple(name.split("."))].numpy()
-        content.update(f"{name} torch.{array.dtype} {list(array.shape)}\n".encode())
-        content.update(array.tobytes())
+    for key in [("next", name) for name in after] + ["action", "episode", "observation", "step"]:
+        array = demo.transitions[key].numpy()
+        content.update(f"{key}torch.{array.dtype}{array.shape}".encode() + array.tobytes())
     assert demo.demo_id == content.hexdigest()[:12]
     assert Demonstration.load(folder).demo_id == demo.demo_id
     assert Demonstration(demo.transitions, {}).demo_id == demo.demo_id
     columns = demo.transitions["observation"].t().contiguous().t()  # The same in another layout.
-    monkeypatch.setattr("giril_rl.demos.demonstration._ROWS", 5)
+    monkeypatch.setattr("giril_rl.demos.demonstration._AT_ONCE", 5)
     assert Demonstration(demo.transitions.replace(observation=columns)).demo_id == demo.demo_id
     demo.transitions["next", "reward"][-1] += 1
     assert demo.demo_id != Demonstration.load(folder).demo_id
