@@ -18,11 +18,14 @@ from torch import Tensor
 from giril_rl.demos.check import check_demonstration
 from giril_rl.demos.demonstration import Demonstration
 from giril_rl.demos.minari_read import check_name, minari_root
+from giril_rl.demos.storage import check_room
 from giril_rl.errors import UserError
 from giril_rl.files import temporary_sibling, write_atomically
 
 PART_BYTES = 16 * 2**20
 """Of a demonstration, handed to Minari at a time: what an export needs besides it."""
+_OVERHEAD = 4096
+"""Bytes that HDF5 needs for each array of an episode, at most."""
 
 
 def to_minari(
@@ -56,6 +59,7 @@ def to_minari(
     Raises:
         UserError: if Minari is not installed or refuses the name, or the demonstration has a
             fault.
+        OSError: ENOSPC if there is not room for it.
 
     Examples:
         >>> demo = Demonstration.load("demos/cartpole")  # doctest: +SKIP
@@ -75,6 +79,7 @@ def to_minari(
     card = demo.card if demo.transitions["next", "done"][-1] else {**demo.card, "last_cut": True}
     arguments = {"algorithm_name": algorithm_name, "description": json.dumps(card), **metadata}
     root = minari_root()
+    check_room(root / dataset_id, demo.transitions, more=_OVERHEAD * demo.num_episodes)
     root.mkdir(parents=True, exist_ok=True)
     temporary = temporary_sibling(root / "export").resolve()  # Minari mistakes relative ones.
     shutil.rmtree(temporary, ignore_errors=True)

@@ -1,4 +1,5 @@
 import json
+import shutil
 import sys
 
 import gymnasium
@@ -120,6 +121,18 @@ def test_an_environment_that_no_text_names_is_its_spaces(cartpole, tmp_path, mon
     assert dataset.env_spec is None
     assert dataset.observation_space == env_class().observation_space
     assert dataset.total_episodes == cartpole.num_episodes
+
+
+def test_nothing_is_begun_where_there_is_no_room(cartpole, tmp_path, monkeypatch):
+    """HDF5 would end the process without a word."""
+    pytest.importorskip("minari")
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "datasets"))
+    room = shutil.disk_usage(tmp_path)
+    # 100 transitions of 63 bytes would fit, the arrays of 3 episodes would not.
+    monkeypatch.setattr(shutil, "disk_usage", lambda place: room._replace(free=20_000))
+    with pytest.raises(OSError, match="No space left"):
+        to_minari(cartpole, "cartpole/test-v0", make_fn)
+    assert not list(tmp_path.iterdir())
 
 
 def test_missing_package_names_the_extra(cartpole, monkeypatch):
