@@ -372,7 +372,7 @@ class UnaveragedRunConfig(RunConfig):
 
 
 @dataclass
-class ExpertRunConfig(RunConfig):
+class ExpertRunConfig(UnaveragedRunConfig):
     """What the expert's own recipe takes: PPO on the true reward."""
 
     steps: int = knob(5_000_000, "most environment steps of expert training (paper: 5M)", low=1)

@@ -28,6 +28,7 @@ from giril_rl.training.interrupt import Interrupt, Interrupted
 from giril_rl.training.restoring import restoring
 from giril_rl.training.threads import made_on_one_thread
 from giril_rl.training.traced import TracedGradients
+from giril_rl.transforms.batch_mean import BatchMeanReward
 from giril_rl.transforms.scaling import ReturnScaling
 
 if TYPE_CHECKING:
@@ -41,11 +42,19 @@ NO_FAILURE = "no_failure"
 
 
 class Trained(NamedTuple):
-    """How long a training was, and how often it was resumed without its running episodes."""
+    """What a training was.
+
+    Attributes:
+        steps: environment steps.
+        seconds: wall-clock seconds.
+        inexact_resumes: how often it was resumed without its running episodes.
+        averaged: whether its rewards were averaged over the environments.
+    """
 
     steps: int
     seconds: float
     inexact_resumes: int = 0
+    averaged: bool = False
 
 
 def train_ppo(
@@ -101,6 +110,7 @@ def train_ppo(
     tracker = EpisodeTracker(cfg.num_envs)
     recent: deque[float] = deque(maxlen=20)
     parts = nn.ModuleDict({"agent": agent, "tracker": tracker, "relabel": relabel})
+    averaged = any(isinstance(part, BatchMeanReward) for part in relabel.modules())
     taken, inexact, exact = 0, 0, True
     saved = run.load(phase)
     if saved is not None:
@@ -110,7 +120,7 @@ def train_ppo(
             recent.extend(saved["recent"])
             if taken >= steps or saved["stopped"]:
                 parts.load_state_dict(saved["parts"])
-                return Trained(taken, saved["seconds"], inexact)
+                return Trained(taken, saved["seconds"], inexact, averaged)
             exact = env.restore_simulator(saved["simulator"])
             inexact += not exact
     batch_size = cfg.num_envs * cfg.rollout
@@ -201,7 +211,7 @@ def train_ppo(
                 break
     if interrupt.requested:  # At the end as well, for the run may have more to do.
         raise Interrupted.at(taken, steps)
-    return Trained(taken, time.perf_counter() - began, inexact)
+    return Trained(taken, time.perf_counter() - began, inexact, averaged)
 
 
 def forget_episodes(parts: nn.Module) -> None:
