@@ -32,7 +32,8 @@ def made(tmp_path):
     """``made(recipe, *words)``: a finished run's folder and its settings."""
 
     def write(recipe, *words):
-        words = ("task=breakout", f"root={tmp_path}", "seed=3", *words)
+        recorded = [] if any(word.startswith("demo.path=") for word in words) else ["demo.path=null"]
+        words = ("task=breakout", f"root={tmp_path}", "seed=3", *recorded, *words)
         found = find(recipe)
         cfg = resolved(found, config_class(found), words)[0]
         folder = tmp_path / recipe / "breakout" / "default" / "seed3"
