@@ -288,7 +288,12 @@ class BCConfig:
     lr: float = knob(3e-3, "AdamW step size, decreasing linearly to zero", low=0, low_open=True)
     weight_decay: float = knob(1.0, "AdamW's weight decay, times the step size", low=0)
     min_scale: float = knob(0.07, "smallest deviation that observations are divided by", low=0)
-    min_std: float = knob(0.01, "Box: smallest deviation of sampled actions", low=0, low_open=True)
+    min_std: float = knob(
+        0.01,
+        "Box: smallest deviation of sampled actions, in units of half their range",
+        low=0,
+        low_open=True,
+    )
     log_every: int = knob(
         100, "gradient steps between logged losses, where held-out ones are compared", low=1
     )
@@ -367,7 +372,7 @@ class UnaveragedRunConfig(RunConfig):
 
 
 @dataclass
-class ExpertRunConfig(RunConfig):
+class ExpertRunConfig(UnaveragedRunConfig):
     """What the expert's own recipe takes: PPO on the true reward."""
 
     steps: int = knob(5_000_000, "most environment steps of expert training (paper: 5M)", low=1)

@@ -40,12 +40,13 @@ from giril_rl.training.scaling import return_scaling
 REWARD = [("next", "reward")]
 
 
-def train_expert(cfg: ExpertRunConfig, folder: Path) -> dict[str, Any]:
+def train_expert(cfg: ExpertRunConfig, folder: Path, *, recipe: str = "expert") -> dict[str, Any]:
     """Trains PPO on the true reward and scores it, or returns what an earlier run left.
 
     Args:
         cfg: the expert's settings.
         folder: the run's folder.
+        recipe: the recipe's name.
 
     Returns:
         The contents of ``result.json``.
@@ -54,7 +55,7 @@ def train_expert(cfg: ExpertRunConfig, folder: Path) -> dict[str, Any]:
         Interrupted: after a checkpoint, if the user asked for it with Ctrl-C.
     """
     check_task(cfg)
-    with Run.open(folder, asdict(cfg), recipe="expert", logger=cfg.logger) as run:
+    with Run.open(folder, asdict(cfg), recipe=recipe, logger=cfg.logger) as run:
         if run.finished:
             return read_result(folder)
         env = make_env(cfg.task, cfg.ppo.num_envs, cfg.seed, use="player")
@@ -75,7 +76,7 @@ def train_expert(cfg: ExpertRunConfig, folder: Path) -> dict[str, Any]:
             stop_at=cfg.task.expert_score if cfg.stop_early else None,
             use="player",
         )
-        return finish_run(run, cfg, agent, trained, method="expert")
+        return finish_run(run, cfg, agent, trained)
 
 
 def obtain_expert(cfg: RunConfig, expert: ExpertConfig) -> tuple[Path, dict[str, Any]]:
