@@ -196,7 +196,7 @@ class GenerativeConfig:
         "observation rule of the reward model",
         choices=("demo_range", "standardise", "raw", "pixels"),
     )
-    clamp: bool = knob(True, "clamp normalised observations to [-1, 1]")
+    clamp: bool = knob(True, "clamp observations to [-1, 1], those of normalise=raw too")
     hidden: list[int] = knob([100, 100], "hidden layers of encoder and decoder (tanh)", low=1)
     seed: int | None = knob(None, "seed of the reward model; null takes the run's seed", low=0)
 
@@ -253,7 +253,7 @@ class CuriosityConfig:
         "observation rule of the reward model",
         choices=("demo_range", "standardise", "raw", "pixels"),
     )
-    clamp: bool = knob(True, "clamp normalised observations to [-1, 1]")
+    clamp: bool = knob(True, "clamp observations to [-1, 1], those of normalise=raw too")
     hidden: list[int] = knob([100, 100], "layers of the features (tanh); [] takes none", low=1)
     model_hidden: list[int] = knob(
         [100], "hidden layers of inverse and forward model (tanh)", low=1
@@ -288,7 +288,12 @@ class BCConfig:
     lr: float = knob(3e-3, "AdamW step size, decreasing linearly to zero", low=0, low_open=True)
     weight_decay: float = knob(1.0, "AdamW's weight decay, times the step size", low=0)
     min_scale: float = knob(0.07, "smallest deviation that observations are divided by", low=0)
-    min_std: float = knob(0.01, "Box: smallest deviation of sampled actions", low=0, low_open=True)
+    min_std: float = knob(
+        0.01,
+        "Box: smallest deviation of sampled actions, in units of half their range",
+        low=0,
+        low_open=True,
+    )
     log_every: int = knob(
         100, "gradient steps between logged losses, where held-out ones are compared", low=1
     )

@@ -13,6 +13,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from giril_rl.configs import TaskConfig
 from giril_rl.envs import for_scores, make_env
+from giril_rl.networks.agents import check_actions
 from giril_rl.randomness import Use, seeded, stream_seed
 
 
@@ -70,6 +71,9 @@ def evaluate(
     Returns:
         The scores; the standard deviation is the sample's (n - 1), 0 for one episode.
 
+    Raises:
+        UserError: if the agent was made for other actions than the task's.
+
     Examples:
         >>> from giril_rl.networks.policy import ActorCritic
         >>> task = TaskConfig(name="cartpole", env_id="CartPole-v1")
@@ -81,6 +85,7 @@ def evaluate(
         (5, True)
     """
     env = make_env(for_scores(task), episodes, seed, use=use)
+    check_actions(agent, env)
     policy = agent.acting()
     mode = ExplorationType.DETERMINISTIC if deterministic else ExplorationType.RANDOM
     returns = torch.zeros(episodes, dtype=torch.float64)

@@ -18,7 +18,7 @@ from torchrl.objectives.value import GAE
 from giril_rl.configs import PPOConfig
 from giril_rl.envs import BatchedEnv
 from giril_rl.errors import UserError
-from giril_rl.networks.agents import Agent
+from giril_rl.networks.agents import Agent, check_actions
 from giril_rl.progress import progress
 from giril_rl.randomness import Use, restore_rng, rng_state, stream_seed
 from giril_rl.training.acting import collecting
@@ -35,7 +35,8 @@ if TYPE_CHECKING:
     from giril_rl.training.reward_learner import RewardLearner
     from giril_rl.training.run import Run
 
-LEARNER_KEYS = ("action", "action_log_prob", "advantage", "value_target")
+LEARNER_KEYS = ("action_log_prob", "advantage", "value_target")
+"""What PPO's loss reads of a minibatch, besides the networks' inputs and the agent's draws."""
 NO_FAILURE = "no_failure"
 """Stands for ``"terminated"`` where a failure is taken for a time limit: False everywhere."""
 
@@ -99,9 +100,11 @@ def train_ppo(
         Environment steps, seconds and inexact resumes, those of earlier processes included.
 
     Raises:
+        UserError: if the agent was made for other actions than the environment's.
         Interrupted: after a checkpoint, if the user asked for it with Ctrl-C.
         RunError: if a loss or a weight is no longer finite; the last checkpoint stays.
     """
+    check_actions(agent, env)
     relabel.to(agent.device)
     learner = PPOLearner(agent, cfg, total_steps=steps, termination=termination)
     tracker = EpisodeTracker(cfg.num_envs)
@@ -266,7 +269,12 @@ class PPOLearner:
             functional=False,
         )
         # The clipped value loss compares with the value as it was.
-        self.keys = (*agent.input_keys, *LEARNER_KEYS, *["state_value"] * cfg.clip_value)
+        self.keys = (
+            *agent.input_keys,
+            agent.drawn_key,
+            *LEARNER_KEYS,
+            *["state_value"] * cfg.clip_value,
+        )
         self.gradients = TracedGradients(
             loss,
             keys=self.keys,
