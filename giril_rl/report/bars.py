@@ -71,7 +71,7 @@ def _bar(axes: Any, place: int, row: Row, mean: Estimate) -> None:
         axes.plot([mean.low, mean.high], [place, place], color="black", linewidth=1.4, marker="|")
     # Beside the axes: no number lies on a line.
     axes.annotate(
-        f"{mean.value:.2f}",
+        f"{mean.value:z.2f}",
         (1.015, place),
         xycoords=("axes fraction", "data"),
         va="center",

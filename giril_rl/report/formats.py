@@ -65,10 +65,10 @@ def with_interval(estimate: Estimate, digits: int = 1) -> str:
         >>> with_interval(Estimate(20.0, 10.0, 30.0)), with_interval(Estimate(20.0, None, None))
         ('20.0 [10.0, 30.0]', '20.0')
     """
-    text = f"{estimate.value:,.{digits}f}"
+    text = f"{estimate.value:z,.{digits}f}"
     if estimate.low is None or estimate.high is None:
         return text
-    return f"{text} [{estimate.low:,.{digits}f}, {estimate.high:,.{digits}f}]"
+    return f"{text} [{estimate.low:z,.{digits}f}, {estimate.high:z,.{digits}f}]"
 
 
 def reference_text(values: Sequence[float]) -> str:

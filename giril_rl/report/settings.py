@@ -12,7 +12,7 @@ from typing import Any
 from giril_rl.errors import UserError
 from giril_rl.naming import NO_EFFECT
 from giril_rl.report.runs import RunRecord
-from giril_rl.report.style import TRUE_REWARD
+from giril_rl.report.style import TRUE_REWARD, is_own
 from giril_rl.schema import flat
 
 WITHOUT_PROFILE = frozenset(
@@ -175,7 +175,8 @@ def shared_changes(
 ) -> Changes:
     """Changes that all runs of one task have in common: the study's own settings, no row's.
 
-    A key counts where runs of at least two methods have it and all that have it agree.
+    A key counts where runs of at least two methods have it and all that have it agree. What a
+    recipe of the user's own has usually is no change of it, and agrees as well.
 
     Args:
         runs: runs of one task.
@@ -191,6 +192,11 @@ def shared_changes(
             if change[0] in run.config and _reads(run, change[0]) and method_of(run) != "expert"
         ]
         methods = {method_of(run) for run in having}
-        if len(methods) > 1 and all(change in changes[run.name] for run in having):
+        agree = (
+            change in changes[run.name]
+            or (is_own(run.method) and text_of(run.config[change[0]]) == change[1])
+            for run in having
+        )
+        if len(methods) > 1 and all(agree):
             found.append(change)
     return tuple(found)

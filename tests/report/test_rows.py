@@ -187,12 +187,14 @@ def test_what_all_runs_share_is_the_panels_and_no_rows(made):
     made("giril", "ppo.clip=0.2", "reward.beta=0.9", score=2.0)
     made("control", "ppo.clip=0.2", score=3.0)
     made("expert", score=4.0)
+    made("gail", "ppo.clip=0.2", score=5.0, extra={"recipe": "mine"}, profile=None)
     (panel,) = panels(made)
     assert panel.shared == (("ppo.clip", "0.2"),)
     assert [(row.name, row.settings) for row in panel.rows] == [
         ("expert", ""),
         ("GIRIL (released)", ""),
         ("GIRIL (released)", "reward.beta=0.9"),
+        ("mine", ""),
         ("control: constant", ""),
     ]
 
