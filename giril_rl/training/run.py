@@ -19,7 +19,7 @@ from giril_rl.naming import NO_EFFECT, without_added
 from giril_rl.places import cannot_write, check_place
 from giril_rl.schema import flat
 from giril_rl.training.checkpoint import load_state, save_state
-from giril_rl.training.metrics import METRICS, MetricsFile, check_logger, make_logger
+from giril_rl.training.metrics import METRICS, MetricsFile, check_logger, end_logger, make_logger
 from giril_rl.untrusted import parse_yaml, read_text
 
 
@@ -131,8 +131,7 @@ class Run:
         try:
             if self._logger is None:
                 self._logger = make_logger(self._logger_name, self.folder)  # type: ignore[arg-type]
-            for key, value in values.items():
-                self._logger.log_scalar(key, float(value), step=step)
+            self._logger.log_metrics({key: float(value) for key, value in values.items()}, step)
         except OSError as error:
             name_file(error, self.folder)
             raise
@@ -168,13 +167,18 @@ class Run:
         """Write ``result.json``, which marks the run as finished."""
         write_json(self.folder / "result.json", result)
 
-    def close(self) -> None:
-        """Let another process have the folder."""
-        experiment: Any = getattr(self._logger, "experiment", None)
-        if hasattr(experiment, "close"):
-            experiment.close()
-        self._logger = None
-        self._lock.release()
+    def close(self, error: BaseException | None = None) -> None:
+        """End the logger's run and let another process have the folder.
+
+        Args:
+            error: why the run ended before its time, if it did.
+        """
+        logger, self._logger = self._logger, None
+        try:
+            if logger is not None:
+                end_logger(logger, error)
+        finally:
+            self._lock.release()
 
     def __enter__(self) -> Run:
         return self
@@ -185,7 +189,7 @@ class Run:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        self.close()
+        self.close(error)
 
     def _refuse_foreign_folder(self) -> None:
         if not self.folder.exists() or (self.folder / "config.yaml").exists():
