@@ -54,13 +54,14 @@ def main(cfg: Config, out: Path) -> None:
         if run.finished:
             return
         demo, expert = obtain_demonstration(cfg, cfg.expert, cfg.demo)
+        pairs = subsample(demo, cfg.demo.subsample)
         env = make_env(cfg.task, cfg.ppo.num_envs, cfg.seed)
 
         reward_seed = cfg.seed if cfg.reward.seed is None else cfg.reward.seed
-        reward = curiosity_reward(cfg.reward, env, demo, seed=reward_seed).to(cfg.device)
+        reward = curiosity_reward(cfg.reward, env, pairs, seed=reward_seed).to(cfg.device)
         fit_reward(
             CuriosityRewardLoss(reward, features=cast(FeatureTraining, cfg.reward.features)),
-            subsample(demo, cfg.demo.subsample),
+            pairs,
             cfg.fit,
             seed=reward_seed,
             run=run,

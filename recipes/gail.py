@@ -51,13 +51,14 @@ def main(cfg: Config, out: Path) -> None:
         if run.finished:
             return
         demo, expert = obtain_demonstration(cfg, cfg.expert, cfg.demo)
+        pairs = subsample(demo, cfg.demo.subsample)
         env = make_env(cfg.task, cfg.ppo.num_envs, cfg.seed)
 
         reward_seed = cfg.seed if cfg.reward.seed is None else cfg.reward.seed
-        reward = discriminator_reward(cfg.reward, env, demo, seed=reward_seed).to(cfg.device)
+        reward = discriminator_reward(cfg.reward, env, pairs, seed=reward_seed).to(cfg.device)
         learner = AdversarialLearner(
             DiscriminatorLoss(reward, penalty=cfg.reward.penalty),
-            subsample(demo, cfg.demo.subsample),
+            pairs,
             cfg.reward,
             seed=reward_seed,
         )

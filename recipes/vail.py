@@ -51,10 +51,11 @@ def main(cfg: Config, out: Path) -> None:
         if run.finished:
             return
         demo, expert = obtain_demonstration(cfg, cfg.expert, cfg.demo)
+        pairs = subsample(demo, cfg.demo.subsample)
         env = make_env(cfg.task, cfg.ppo.num_envs, cfg.seed)
 
         reward_seed = cfg.seed if cfg.reward.seed is None else cfg.reward.seed
-        reward = bottleneck_reward(cfg.reward, env, demo, seed=reward_seed).to(cfg.device)
+        reward = bottleneck_reward(cfg.reward, env, pairs, seed=reward_seed).to(cfg.device)
         learner = AdversarialLearner(
             BottleneckLoss(
                 reward,
@@ -63,7 +64,7 @@ def main(cfg: Config, out: Path) -> None:
                 beta=cfg.reward.beta_start,
                 penalty=cfg.reward.penalty,
             ),
-            subsample(demo, cfg.demo.subsample),
+            pairs,
             cfg.reward,
             seed=reward_seed,
         )

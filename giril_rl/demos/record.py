@@ -18,9 +18,9 @@ from giril_rl.demos.distinct import DistinctEpisodes
 from giril_rl.demos.replay import as_executed, as_recorded, verify_by_replay
 from giril_rl.envs.stdout import silent_stdout
 from giril_rl.errors import UserError
-from giril_rl.files import installed_versions
+from giril_rl.files import installed_versions, processor
 from giril_rl.progress import progress
-from giril_rl.randomness import seeded
+from giril_rl.randomness import seeded, stream_seed
 
 _LONGEST_EPISODE = 1_000_000
 
@@ -32,7 +32,7 @@ def episode_seed(seed: int, episode: int) -> int:
         >>> len({episode_seed(seed, episode) for seed in range(3) for episode in range(100)})
         300
     """
-    return int(np.random.SeedSequence([seed, episode]).generate_state(1)[0])
+    return stream_seed("demonstration", seed, episode, bits=32)
 
 
 def record_demonstration(
@@ -72,7 +72,8 @@ def record_demonstration(
 
     Returns:
         The demonstration; its card has ``task``, ``env_id``, ``seed``, ``seeds``, ``length``,
-        ``deterministic``, ``expert``, ``versions``, ``transitions`` and ``episode_returns``, a
+        ``deterministic``, ``expert``, ``versions``, ``processor``, ``transitions`` and
+        ``episode_returns``, a
         game's also ``lives``, ``lives_left`` (at each episode's beginning and end) and ``actions``,
         their names.
 
@@ -132,6 +133,7 @@ def record_demonstration(
         "deterministic": deterministic,
         "expert": expert,
         "versions": installed_versions(),
+        "processor": processor(),
         "transitions": len(demo),
         "episode_returns": demo.returns.tolist(),
     }

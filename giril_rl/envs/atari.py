@@ -20,6 +20,7 @@ from giril_rl.envs.saved import (
     saved_tensor,
 )
 from giril_rl.errors import UserError
+from giril_rl.randomness import Use
 
 Episode = Literal["life", "game"]
 
@@ -61,6 +62,7 @@ class AtariEnv(BatchedEnv):
         num_envs: number of games.
         episode: "life" or "game".
         seed: root of the games' seeds.
+        use: what the episodes are for; those of two uses never have equal seeds.
         frame_cap: emulated frames after which a game is cut (truncated).
 
     Raises:
@@ -82,11 +84,12 @@ class AtariEnv(BatchedEnv):
         *,
         episode: Episode = "life",
         seed: int = 0,
+        use: Use = "training",
         frame_cap: int = FRAME_CAP,
     ) -> None:
         if episode not in ("life", "game"):
             raise UserError(f"task.episode={episode}: choose one of life, game.")
-        super().__init__(num_envs, seed=seed)
+        super().__init__(num_envs, seed=seed, use=use)
         self._games = [AtariGame(game, frame_cap) for _ in range(num_envs)]
         self._longest = -(-frame_cap // SKIP)
         self._lives_end = episode == "life"

@@ -14,6 +14,7 @@ from torchrl.data import Categorical
 from giril_rl.envs.saved import saved_array
 from giril_rl.envs.vector import GymVectorEnv
 from giril_rl.errors import UserError
+from giril_rl.randomness import Use
 
 AfterFailure = Literal["reset", "continue"]
 
@@ -43,6 +44,7 @@ class FixedHorizonEnv(GymVectorEnv):
         num_envs: number of copies.
         after_failure: "reset" or "continue".
         seed: root of the episodes' seeds; each hidden reset begins an episode with its own.
+        use: what the episodes are for; those of two uses never have equal seeds.
         max_episode_steps: the horizon; None takes the limit that the environment has.
 
     Raises:
@@ -68,9 +70,10 @@ class FixedHorizonEnv(GymVectorEnv):
         *,
         after_failure: AfterFailure = "reset",
         seed: int = 0,
+        use: Use = "training",
         max_episode_steps: int | None = None,
     ) -> None:
-        super().__init__(make_fn, num_envs, seed=seed, max_episode_steps=max_episode_steps)
+        super().__init__(make_fn, num_envs, seed=seed, use=use, max_episode_steps=max_episode_steps)
         if self._limit is None:
             raise UserError(
                 "an environment without a time limit has no fixed horizon: "

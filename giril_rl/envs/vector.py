@@ -17,6 +17,7 @@ from giril_rl.envs.saved import check_actions, check_counts, saved_array, saved_
 from giril_rl.envs.spaces import action_spec, without_bookkeeping
 from giril_rl.envs.stdout import silent_stdout
 from giril_rl.errors import UserError
+from giril_rl.randomness import Use
 
 
 class GymVectorEnv(BatchedEnv):
@@ -40,6 +41,7 @@ class GymVectorEnv(BatchedEnv):
             or Discrete action space. Discrete actions are integers, not one-hot vectors.
         num_envs: number of copies, the environment's batch size.
         seed: root of the episodes' seeds.
+        use: what the episodes are for; those of two uses never have equal seeds.
         max_episode_steps: time limit in steps; None takes the one that ``make_fn``'s environment
             is registered with.
 
@@ -59,9 +61,10 @@ class GymVectorEnv(BatchedEnv):
         num_envs: int,
         *,
         seed: int = 0,
+        use: Use = "training",
         max_episode_steps: int | None = None,
     ) -> None:
-        super().__init__(num_envs, seed=seed)
+        super().__init__(num_envs, seed=seed, use=use)
         self._gym_envs: list[gymnasium.Env] = []
         self._limit = max_episode_steps
         with silent_stdout():

@@ -18,6 +18,7 @@ from giril_rl.networks.agents import Agent
 from giril_rl.networks.normalise import RunningNormaliser
 from giril_rl.networks.policy import NORMALISED
 from giril_rl.progress import progress
+from giril_rl.randomness import stream_seed
 from giril_rl.rewards.chunks import PIXELS_AT_ONCE
 from giril_rl.training.finite import Finite
 from giril_rl.training.interrupt import Interrupt, Interrupted
@@ -85,7 +86,7 @@ def clone_behaviour(
     optimizer = torch.optim.AdamW(
         agent.actor.parameters(), lr=cfg.lr, weight_decay=cfg.weight_decay, fused=True
     )
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(stream_seed("training", seed))
     step, seconds = 0, 0.0
     best: dict[str, Any] = {"step": 0, "loss": float("inf"), "actor": {}}
     saved = run.load(phase)

@@ -8,7 +8,7 @@ import json
 import math
 import sys
 from collections.abc import Iterator
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -56,8 +56,8 @@ def train_expert(cfg: ExpertRunConfig, folder: Path) -> dict[str, Any]:
     with Run.open(folder, asdict(cfg), recipe="expert", logger=cfg.logger) as run:
         if run.finished:
             return read_result(folder)
-        env = make_env(cfg.task, cfg.ppo.num_envs, cfg.seed)
-        agent = make_agent(env, cfg.ppo, cfg.seed).to(cfg.device)
+        env = make_env(cfg.task, cfg.ppo.num_envs, cfg.seed, use="player")
+        agent = make_agent(env, cfg.ppo, cfg.seed, use="player").to(cfg.device)
         relabel = (
             [SignTransform(REWARD)]
             if cfg.clip_reward
@@ -72,6 +72,7 @@ def train_expert(cfg: ExpertRunConfig, folder: Path) -> dict[str, Any]:
             seed=cfg.seed,
             run=run,
             stop_at=cfg.task.expert_score if cfg.stop_early else None,
+            use="player",
         )
         return finish_run(run, cfg, agent, trained, method="expert")
 
@@ -111,7 +112,7 @@ def expert_settings(cfg: RunConfig, expert: ExpertConfig) -> ExpertRunConfig:
             threads=cfg.threads,
             device=cfg.device,
             steps=expert.steps_on(cfg.task),
-            seed=expert.seed,
+            seed=cfg.seed if expert.seed is None else expert.seed,
             stop_early=expert.stop_early,
         )
     )
@@ -135,14 +136,15 @@ def check_inputs(cfg: RunConfig, expert: ExpertConfig, demo: DemoConfig) -> None
     """
     check_task(cfg)
     if demo.path is not None:
-        _given_demonstration(cfg.task, demo.path)
+        _given_demonstration(cfg, demo.path)
     elif expert.path is not None:
         folder, _ = obtain_expert(cfg, expert)
         load_agent(folder, cfg.task)
 
 
-def _given_demonstration(task: TaskConfig, path: str) -> Demonstration:
-    folder = demonstration_folder(path, task)
+def _given_demonstration(cfg: RunConfig, path: str) -> Demonstration:
+    task = cfg.task
+    folder = demonstration_folder(path, task, cfg.seed)
     shape, spec = spaces_of(task)
     demo = Demonstration.load(folder)
     try:
@@ -165,11 +167,11 @@ def obtain_demonstration(
         UserError: if the demonstration does not fit the task.
     """
     if demo.path is not None:
-        given = _given_demonstration(cfg.task, demo.path)
+        given = _given_demonstration(cfg, demo.path)
         return given, _known_expert(given)
     source, result = obtain_expert(cfg, expert)
     task = as_recorded_task(cfg.task, demo.lives)
-    folder = Path(cfg.root) / demonstration_place(cfg.task, demo, result["config_hash"])
+    folder = Path(cfg.root) / demonstration_place(cfg, demo, result["config_hash"])
     with made_once(folder, "demonstration"):
         remove_leftovers(folder)
         if not folder.exists():
@@ -177,12 +179,12 @@ def obtain_demonstration(
             recorded = record_demonstration(
                 gym_factory(task),
                 _player(agent, deterministic=demo.deterministic),
-                seed=demo.seed,
+                seed=cfg.seed if demo.seed is None else demo.seed,
                 length=demo.length,
                 episodes=demo.episodes,
                 deterministic=demo.deterministic,
                 task=task.name,
-                expert={"return_mean": result["return_mean"], "seed": result["seed"]},
+                expert={key: result[key] for key in ("return_mean", "seed", "env_steps")},
                 lives=demo.lives if task.is_atari else None,
             )
             recorded.save(folder)
@@ -197,21 +199,22 @@ def _known_expert(demo: Demonstration) -> dict[str, Any] | None:
     return None
 
 
-def demonstration_place(task: TaskConfig, demo: DemoConfig, expert: str) -> Path:
+def demonstration_place(cfg: RunConfig, demo: DemoConfig, expert: str) -> Path:
     """Where a recorded demonstration lies below the root of runs.
 
     Args:
-        task: the recipe's task.
+        cfg: the recipe's settings, of which task and seed count.
         demo: what is recorded.
         expert: the expert's ``config_hash``.
 
     Examples:
-        >>> pong = TaskConfig(name="pong", env_id="ALE/Pong-v5")
+        >>> pong = RunConfig(task=TaskConfig(name="pong", env_id="ALE/Pong-v5"))
         >>> demonstration_place(pong, DemoConfig(), "0123456789ab").parent.as_posix()
         'demos/pong'
     """
-    identity = _identity(as_recorded_task(task, demo.lives), demo, expert)
-    return Path("demos") / safe(task.name) / identity
+    demo = replace(demo, seed=cfg.seed if demo.seed is None else demo.seed)
+    identity = _identity(as_recorded_task(cfg.task, demo.lives), demo, expert)
+    return Path("demos") / safe(cfg.task.name) / identity
 
 
 def _identity(task: TaskConfig, demo: DemoConfig, expert: str) -> str:

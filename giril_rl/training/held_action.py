@@ -89,7 +89,9 @@ def held_action_scores(task: TaskConfig, *, episodes: int, seed: int) -> list[fl
     with progress(count, desc="held actions", unit="actions") as bar:
         for action in range(count):
             policy = HeldAction(spec, action)
-            played = evaluate(policy, task, episodes=episodes, seed=seed, deterministic=True)
+            played = evaluate(
+                policy, task, episodes=episodes, seed=seed, deterministic=True, use="training"
+            )
             scores.append(played.return_mean)
             bar.update(1)
     return scores

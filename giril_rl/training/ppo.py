@@ -19,7 +19,7 @@ from giril_rl.envs import BatchedEnv
 from giril_rl.errors import UserError
 from giril_rl.networks.agents import Agent
 from giril_rl.progress import progress
-from giril_rl.randomness import restore_rng, rng_state
+from giril_rl.randomness import Use, restore_rng, rng_state, stream_seed
 from giril_rl.training.acting import collecting
 from giril_rl.training.episodes import EpisodeTracker
 from giril_rl.training.finite import Finite
@@ -57,6 +57,7 @@ def train_ppo(
     stop_at: float | None = None,
     learn_reward: RewardLearner | None = None,
     termination: str = "ends",
+    use: Use = "training",
 ) -> Trained:
     """Trains ``agent`` in place on the reward that ``relabel`` writes; resumes by itself.
 
@@ -79,6 +80,7 @@ def train_ppo(
         learn_reward: trains the reward model beside the policy, on each batch before ``relabel``
             uses it; its state is checkpointed.
         termination: "ends" or "bootstrap", see :class:`PPOLearner`.
+        use: what the random numbers are for: "training", or "player" for an expert.
 
     Returns:
         Environment steps and seconds, those of earlier processes included.
@@ -116,7 +118,7 @@ def train_ppo(
         return_same_td=True,
     )
     # Only now, for making a collector may draw random numbers.
-    torch.manual_seed(seed)
+    torch.manual_seed(stream_seed(use, seed))
     if saved is not None:
         with restoring(run, phase):
             parts.load_state_dict(saved["parts"])

@@ -10,6 +10,7 @@ from torchrl.data import TensorSpec, Unbounded
 from giril_rl.configs import TaskConfig
 from giril_rl.demos.task import spaces_of
 from giril_rl.errors import UserError
+from giril_rl.randomness import stream_seed
 
 RANDOM = "control:random"
 """The method's name in ``result.json``; such a run holds no policy."""
@@ -49,7 +50,7 @@ class RandomPolicy(TensorDictModuleBase):
         self.out_keys = ["action"]
         self.action_spec = action_spec
         self.seed = seed
-        self._stream = torch.Generator().manual_seed(seed).get_state()
+        self._stream = torch.Generator().manual_seed(stream_seed("training", seed)).get_state()
 
     @classmethod
     def of_task(cls, task: TaskConfig, seed: int = 0) -> RandomPolicy:

@@ -7,13 +7,15 @@ from typing import Any
 
 from torch import nn
 
-from giril_rl.configs import RunConfig
+from giril_rl.configs import DemoConfig, RunConfig
 from giril_rl.demos import Demonstration
+from giril_rl.files import processor
 from giril_rl.naming import config_hash
 from giril_rl.networks.agents import Agent
 from giril_rl.pretrained import Pretrained
 from giril_rl.report.curve import write_curve
 from giril_rl.report.losses import loss_points, write_losses
+from giril_rl.shipped import demonstration_name
 from giril_rl.training.agent import POLICY
 from giril_rl.training.evaluate import evaluate_both
 from giril_rl.training.held_action import HeldAction
@@ -89,9 +91,12 @@ def finish_run(
         "steps_per_second": trained.steps / max(trained.seconds, 1e-9),
         "expert_return_mean": None if expert is None else expert["return_mean"],
         "demo_return_mean": _mean_return(demo) if demo is not None and demo.has_rewards else None,
+        "demo": None if demo is None else _source(cfg, demo),
+        "demo_id": None if demo is None else demo.demo_id,
         "demo_transitions": None if demo is None else len(demo),
         "config_hash": config_hash(cfg),
         "versions": run.versions,
+        "processor": processor(),
         "finished_at": datetime.now(UTC).isoformat(timespec="seconds"),
     }
     if isinstance(agent, HeldAction):
@@ -118,6 +123,14 @@ def finish_run(
         )
     run.finish(result)
     return result
+
+
+def _source(cfg: RunConfig, demo: Demonstration) -> str:
+    """Which demonstration it was: ``shipped:NAME/INDEX``, the given path, or who played it."""
+    chosen = getattr(cfg, "demo", None)
+    if isinstance(chosen, DemoConfig) and chosen.path is not None:
+        return demonstration_name(chosen.path, cfg.task, cfg.seed)
+    return f"player {_seeds_of(demo)['expert']}, seed {demo.card.get('seed')}"
 
 
 def _seeds_of(demo: Demonstration | None) -> dict[str, int | None]:

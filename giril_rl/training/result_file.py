@@ -62,7 +62,10 @@ OPTIONAL: dict[str, Check] = {
     "steps_per_second": _or_none(_number),
     "expert_return_mean": _or_none(_number),
     "demo_return_mean": _or_none(_number),
+    "demo": _or_none(_word),
+    "demo_id": _or_none(_word),
     "demo_transitions": _or_none(_natural),
+    "processor": _or_none(_word),
     "held_action": _natural,
 }
 """What runs of some kind, or of an earlier version, have not."""

@@ -164,7 +164,7 @@ def set_to(folder, key, value):
 
 def test_the_packages_own_demonstration_is_found(made, tmp_path):
     folder, _ = made("giril", "demo.path=shipped")
-    shipped = Demonstration.load(shipped_demonstrations()["breakout"])
+    shipped = Demonstration.load(shipped_demonstrations()["breakout"][0])
     assert find_demonstration(folder, tmp_path) is None  # Of six transitions there is none.
     result = {**RESULT, "demo_transitions": len(shipped)}
     (folder / "result.json").write_text(json.dumps(result))
