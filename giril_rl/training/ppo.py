@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import time
 from collections import deque
-from typing import TYPE_CHECKING, Any, NamedTuple
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, Concatenate, NamedTuple, ParamSpec
 
 import torch
 from tensordict import TensorDictBase
@@ -44,6 +46,24 @@ class Trained(NamedTuple):
     seconds: float
 
 
+Rest = ParamSpec("Rest")
+
+
+def _closing_env(
+    train: Callable[Concatenate[BatchedEnv, Rest], Trained],
+) -> Callable[Concatenate[BatchedEnv, Rest], Trained]:
+    @functools.wraps(train)
+    def closing(env: BatchedEnv, *args: Rest.args, **kwargs: Rest.kwargs) -> Trained:
+        try:
+            return train(env, *args, **kwargs)
+        finally:
+            if not env.is_closed:  # By the collector.
+                env.close()
+
+    return closing
+
+
+@_closing_env
 def train_ppo(
     env: BatchedEnv,
     agent: Agent,
@@ -66,7 +86,7 @@ def train_ppo(
     on, the simulators' state included, so that an interrupted run ends with the same weights.
 
     Args:
-        env: the training environments; closed at the end.
+        env: the training environments; closed at the end, however that comes.
         agent: policy and value network; where its weights are, batches go and learning happens.
         relabel: a transform or a composition of them, called with each batch ``(num_envs, time)``;
             its ``state_dict`` is checkpointed.
@@ -145,6 +165,7 @@ def train_ppo(
             recent.extend(returns.tolist())
             if agent.device.type != "cpu":
                 batch = batch.to(agent.device)
+            finite.observations(batch, taken + batch_size)
             learned = {} if learn_reward is None else learn_reward.update(batch)
             losses = learner.learn(relabel(batch), taken)
             taken += batch_size
@@ -159,7 +180,8 @@ def train_ppo(
                 true_return = f"{metrics['train/return_mean']:,.1f}"
             bar.update(batch_size, true_return=true_return)
             run.log(taken, metrics, phase=phase)
-            finite.losses({**learned, **losses}, taken)
+            finite.losses(learned, taken)
+            finite.losses(losses, taken, batch.select(("next", "reward")))
             if stop_at is not None and len(recent) == recent.maxlen:
                 stopped = sum(recent) / len(recent) >= stop_at
             asked = interrupt.requested
@@ -182,7 +204,8 @@ def train_ppo(
             if stopped or asked:
                 break
     if interrupt.requested:  # At the end as well, for the run may have more to do.
-        raise Interrupted.at(taken, steps)
+        whose = "player" if run.recipe == "expert" else "policy"
+        raise Interrupted.at(taken, steps, part=f"the {whose}'s training", most=stop_at is not None)
     return Trained(taken, time.perf_counter() - began)
 
 
