@@ -196,7 +196,7 @@ class GenerativeConfig:
         "observation rule of the reward model",
         choices=("demo_range", "standardise", "raw", "pixels"),
     )
-    clamp: bool = knob(True, "clamp normalised observations to [-1, 1]")
+    clamp: bool = knob(True, "clamp observations to [-1, 1], those of normalise=raw too")
     hidden: list[int] = knob([100, 100], "hidden layers of encoder and decoder (tanh)", low=1)
     seed: int | None = knob(None, "seed of the reward model; null takes the run's seed", low=0)
 
@@ -253,7 +253,7 @@ class CuriosityConfig:
         "observation rule of the reward model",
         choices=("demo_range", "standardise", "raw", "pixels"),
     )
-    clamp: bool = knob(True, "clamp normalised observations to [-1, 1]")
+    clamp: bool = knob(True, "clamp observations to [-1, 1], those of normalise=raw too")
     hidden: list[int] = knob([100, 100], "layers of the features (tanh); [] takes none", low=1)
     model_hidden: list[int] = knob(
         [100], "hidden layers of inverse and forward model (tanh)", low=1

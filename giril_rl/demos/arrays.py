@@ -14,7 +14,7 @@ from giril_rl.errors import UserError
 NEEDED = ("observation", "action", "next_observation", "terminated", "truncated")
 """One row per transition each; ``reward`` may be there as well."""
 _FLAGS = ("terminated", "truncated")
-_LOSSLESS_ENOUGH = "fiu"  # numpy's kinds: float, signed and unsigned integer
+_NUMBERS = "fiub"  # numpy's kinds: float, signed and unsigned integer, bool
 
 
 def to_transitions(columns: Mapping[str, np.ndarray]) -> TensorDict:
@@ -152,7 +152,7 @@ def _described(array: np.ndarray) -> str:
 
 
 def _float32(name: str, array: np.ndarray) -> np.ndarray:
-    if array.dtype.kind not in _LOSSLESS_ENOUGH:
+    if array.dtype.kind not in _NUMBERS:
         raise UserError(f"the data set has {name} of {_described(array)}: numbers are needed.")
     with np.errstate(over="ignore"):  # The check of infinities tells where.
         return np.ascontiguousarray(array, dtype=np.float32)
@@ -180,10 +180,10 @@ def _observation(name: str, array: np.ndarray) -> Tensor:
         )
     if array.dtype == np.uint8 and array.ndim == 4:
         return torch.from_numpy(np.array(array, order="C"))
-    if array.dtype.kind != "f" or array.ndim != 2:
+    if array.ndim != 2:
         raise UserError(
-            f"the data set has {name} of {_described(array)}: vectors must be float32 or float64 "
-            "[N, d], images uint8 [N, c, h, w]."
+            f"the data set has {name} of {_described(array)}: vectors must be [N, d], images uint8 "
+            "[N, c, h, w]."
         )
     return torch.from_numpy(_float32(name, array))
 

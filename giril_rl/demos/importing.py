@@ -21,7 +21,7 @@ from giril_rl.errors import UserError
 from giril_rl.files import installed_versions
 
 MINARI = "minari:"
-_DTYPES = ("float32", "float64", "uint8", "int32", "int64", "bool")
+_DTYPES = ("float32", "float64", "uint8", "int8", "int16", "int32", "int64", "bool")
 _NEXT = {"observation": "next_observation", "reward": "reward"}
 _Read = tuple[dict[str, np.ndarray], dict[str, Any]]
 

@@ -16,6 +16,8 @@ from giril_rl.demos.check import check_demonstration
 from giril_rl.demos.demonstration import Demonstration
 from giril_rl.demos.distinct import DistinctEpisodes
 from giril_rl.demos.replay import as_executed, as_recorded, verify_by_replay
+from giril_rl.envs.checking import check_reset, check_step, env_name
+from giril_rl.envs.spaces import check_action_space
 from giril_rl.envs.stdout import silent_stdout
 from giril_rl.errors import UserError
 from giril_rl.files import installed_versions, processor
@@ -57,7 +59,7 @@ def record_demonstration(
 
     Args:
         make_fn: makes the Gymnasium environment: flat observation or uint8 images [c, h, w], Box
-            or Discrete actions.
+            or Discrete actions, as :class:`~giril_rl.envs.GymVectorEnv` takes them.
         policy: observation float32 [1, d], or uint8 [1, c, h, w], -> action float [1, a] (Box) or
             int64 [1] (Discrete); it returns is played, so it decides itself between mean and
             sample.
@@ -79,7 +81,8 @@ def record_demonstration(
 
     Raises:
         UserError: unless exactly one of ``length`` and ``episodes`` is positive; for an action that
-            is not finite or not in the space; for an environment that does not repeat.
+            is not finite or not in the space; for an environment that does not repeat, or whose
+            spaces, observations or rewards are not what they should be.
 
     Examples:
         >>> demo = record_demonstration(
@@ -95,6 +98,7 @@ def record_demonstration(
             "least 1, and null for the other."
         )
     env = make_fn()
+    check_action_space(env.action_space, env_name(env))
     rows: list[dict[str, Any]] = []
     seeds: list[int] = []
     lives_left: list[list[int]] = []
@@ -155,13 +159,13 @@ def _play(
     """One episode from ``seed``, or its first ``most`` transitions, and lives before and after."""
     rows: list[dict[str, Any]] = []
     with silent_stdout():  # the simulator connects here
-        observation, info = env.reset(seed=seed)
+        observation, info = check_reset(env, env.reset(seed=seed))
     lives = [info.get("lives")]
     before = as_recorded(observation)
     while len(rows) < most:
         action = _choose(policy, before, env.action_space)
-        observation, reward, terminated, truncated, info = env.step(
-            as_executed(action, env.action_space)
+        observation, reward, terminated, truncated, info = check_step(
+            env, env.step(as_executed(action, env.action_space))
         )
         after = as_recorded(observation)
         rows.append(

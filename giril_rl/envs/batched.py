@@ -120,19 +120,15 @@ class BatchedEnv(EnvBase):
         """What :meth:`restore_simulator` needs to bring another instance to this very moment."""
 
     @abstractmethod
-    def restore_simulator(self, state: dict[str, Any]) -> None:
+    def restore_simulator(self, state: dict[str, Any]) -> bool:
         """Replays the running episodes; the next :meth:`reset` hands out where they stand.
 
         Args:
             state: what :meth:`simulator_state` returned for an equal environment.
 
+        Returns:
+            Whether the replay came to the same moment; if not, all simulators begin new episodes.
+
         Raises:
             ValueError: if it is no state of such an environment; nothing is played then.
         """
-
-
-NOT_REPEATING = (
-    "the simulator does not repeat itself for equal seeds and actions, so that this run cannot be "
-    "continued: start it again in another folder (out=...)."
-)
-"""The refusal of a replay that ends elsewhere than it was saved."""

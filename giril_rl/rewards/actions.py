@@ -32,7 +32,8 @@ class ActionEncoder(nn.Module):
             Composite of nothing else.
 
     Raises:
-        UserError: for a spec of another kind.
+        UserError: for a spec of another kind, or actions of another encoding than the spec's. Only
+            their dtype and shape are looked at, so that the encoder can be recorded as a graph.
 
     Examples:
         >>> ActionEncoder(Categorical(3))(torch.tensor([2, 0])).tolist()
@@ -78,8 +79,76 @@ class ActionEncoder(nn.Module):
         for name, value in {"low": low, "high": high, "offset": offset, "scale": scale}.items():
             self.register_buffer(name, value.to(torch.get_default_dtype()))
 
+    @property
+    def kind(self) -> str:
+        """What the actions are, in a word or two."""
+        if self.one_hot:
+            return "one-hot vectors"
+        return "integers" if self.discrete else "vectors"
+
+    @property
+    def event(self) -> tuple[int, ...]:
+        """The shape of one action."""
+        return () if self.discrete and not self.one_hot else (self.size,)
+
+    def batch(self, action: Tensor) -> torch.Size:
+        """The leading shape of actions, whose dtype and width are checked.
+
+        Raises:
+            UserError: for another dtype or width.
+
+        Examples:
+            >>> from torchrl.data import OneHot
+            >>> ActionEncoder(OneHot(3)).batch(torch.tensor([2, 0]))
+            Traceback (most recent call last):
+            giril_rl.errors.UserError: actions are torch.int64 of shape (2,): the reward reads
+            one-hot vectors of shape (*batch, 3). Give those, or build it with these actions' own
+            spec.
+        """
+        if self.event:
+            fits = action.shape[-1:] == self.event
+        else:
+            fits = not action.is_floating_point()
+        if not fits:
+            shape = f"(*batch, {self.size})" if self.event else "(*batch,)"
+            raise UserError(
+                f"actions are {action.dtype} of shape {tuple(action.shape)}: the reward reads "
+                f"{self.kind} of shape {shape}. Give those, or build it with these actions' own "
+                "spec."
+            )
+        return action.shape[: action.ndim - len(self.event)]
+
+    def check_values(self, action: Tensor) -> None:
+        """Refuses what has the right shape and is no action. It looks at values, so call it once.
+
+        Raises:
+            UserError: for integers outside the spec, or vectors that are not one-hot.
+
+        Examples:
+            >>> ActionEncoder(Categorical(3)).check_values(torch.tensor([0, 3]))
+            Traceback (most recent call last):
+            giril_rl.errors.UserError: the demonstration's action at index [1] is 3: the reward's
+            action spec has integers from 0 to 2.
+        """
+        if not self.discrete:
+            return
+        if self.one_hot:
+            wrong = (action != 0).sum(-1) != 1
+            wrong |= (action == 1).sum(-1) != 1
+            needed = f"one-hot vectors of {self.size} numbers"
+        else:
+            wrong = (action < 0) | (action >= self.size)
+            needed = f"integers from 0 to {self.size - 1}"
+        if wrong.any():
+            index = wrong.nonzero()[0].tolist()
+            raise UserError(
+                f"the demonstration's action at index {index} is {action[tuple(index)].tolist()}: "
+                f"the reward's action spec has {needed}."
+            )
+
     def forward(self, action: Tensor) -> Tensor:
         """The action codes ``(*batch, size)``."""
+        self.batch(action)
         if self.one_hot:
             return action.to(torch.get_default_dtype())
         if self.discrete:
@@ -91,9 +160,11 @@ class ActionEncoder(nn.Module):
 
     def target(self, action: Tensor) -> Tensor:
         """What the encoder's latent is fitted to: class indices if discrete, else the code."""
-        if self.one_hot:
-            return action.to(torch.uint8).argmax(-1)
-        return action.long() if self.discrete else self(action)
+        if self.discrete and not self.one_hot:
+            self.batch(action)
+            return action.long()
+        code = self(action)
+        return code.argmax(-1) if self.one_hot else code
 
     def extra_repr(self) -> str:
         """Shows kind and size when printed."""

@@ -20,6 +20,7 @@ from giril_rl.rewards.chunks import per_transition
 from giril_rl.rewards.keys import REWARD_KEYS, TRANSITION_KEYS, check_keys
 from giril_rl.rewards.pixel_scaler import PixelScaler
 from giril_rl.rewards.scaler import ObservationScaler, ScalingRule
+from giril_rl.rewards.transitions import check_output, check_transitions, read
 
 
 def feature_error(predicted: Tensor, features: Tensor) -> Tensor:
@@ -31,11 +32,15 @@ def feature_error(predicted: Tensor, features: Tensor) -> Tensor:
         predicted: the forward model's ``phi_hat(s')``, ``(*batch, features)``.
         features: ``phi(s')``, of the same shape.
 
+    Raises:
+        UserError: if it is of another shape.
+
     Examples:
         >>> import torch
         >>> feature_error(torch.tensor([[0.5, 1.0]]), torch.tensor([[0.5, -1.0]]))
         tensor([4.])
     """
+    check_output("the forward model", predicted, features.shape)
     return (predicted - features).square().sum(-1)
 
 
@@ -61,7 +66,7 @@ class CuriosityReward(Pretrained, TensorDictModuleBase):
         out_keys: where the reward is written, one key.
 
     Raises:
-        UserError: for another number of keys.
+        UserError: for another number of keys, or entries that are missing or of a wrong shape.
 
     Examples:
         >>> import torch
@@ -170,7 +175,7 @@ class CuriosityReward(Pretrained, TensorDictModuleBase):
         mode; :class:`~giril_rl.transforms.IntrinsicReward` calls it in eval mode.
 
         Args:
-            action_spec: the environment's action spec, discrete.
+            action_spec: the environment's action spec.
             channels: frames in an observation.
             scale: see :meth:`for_vectors`, as for all others.
             seed: seed of the weights.
@@ -206,8 +211,8 @@ class CuriosityReward(Pretrained, TensorDictModuleBase):
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes each transition's reward."""
-        observation, action, following = (tensordict.get(key) for key in self.in_keys)
-        transitions = (observation, action, following)
+        transitions = read(tensordict, self.in_keys)
+        check_transitions(self.scaler, self.actions, *transitions)
         error = per_transition(self._error, transitions, self.scaler.event_dims)
         return tensordict.set(self.out_keys[0], self.scale * error.unsqueeze(-1))
 

@@ -11,6 +11,7 @@ from giril_rl.errors import UserError
 from giril_rl.rewards.curiosity import CuriosityReward, feature_error
 from giril_rl.rewards.generative_loss import action_term
 from giril_rl.rewards.transition_loss import Reduction, TransitionLoss
+from giril_rl.rewards.transitions import check_transitions
 
 FeatureTraining = Literal["inverse", "both", "none"]
 
@@ -77,6 +78,7 @@ class CuriosityRewardLoss(TransitionLoss):
     ) -> tuple[Tensor, Tensor]:
         """The two terms, from which phi learns as ``features`` says."""
         reward = self.reward
+        check_transitions(reward.scaler, reward.actions, observation, action, following)
         phi = reward.features(reward.scaler(observation))
         next_phi = reward.features(reward.scaler(following))
         if self.features == "none":

@@ -24,13 +24,14 @@ from giril_rl.demos.task import as_recorded_task, check_environment, spaces_of
 from giril_rl.envs import gym_factory, make_env, with_own_episodes
 from giril_rl.errors import UserError
 from giril_rl.files import missing, remove_empty, remove_leftovers
-from giril_rl.naming import out_folder, safe, without_added
+from giril_rl.naming import NO_EFFECT, out_folder, safe, without_added
 from giril_rl.networks.agents import Agent
 from giril_rl.randomness import check_device
 from giril_rl.shipped import demonstration_folder
 from giril_rl.task_defaults import apply_task_defaults
 from giril_rl.training.agent import load_agent, make_agent
 from giril_rl.training.finished import read_result
+from giril_rl.training.outlook import announce
 from giril_rl.training.ppo import train_ppo
 from giril_rl.training.result import finish_run
 from giril_rl.training.run import Run
@@ -166,6 +167,9 @@ def obtain_demonstration(
     Raises:
         UserError: if the demonstration does not fit the task.
     """
+    settings = expert_settings(cfg, expert)
+    has_player = (out_folder("expert", settings, {}) / "result.json").exists()
+    announce(cfg, expert, demo, has_player=has_player)
     if demo.path is not None:
         given = _given_demonstration(cfg, demo.path)
         return given, _known_expert(given)
@@ -221,7 +225,7 @@ def _identity(task: TaskConfig, demo: DemoConfig, expert: str) -> str:
     """Twelve hex digits of what decides a demonstration."""
     unread = {"path", "subsample"} | (set() if task.is_atari else {"lives"})
     chosen = {key: value for key, value in asdict(demo).items() if key not in unread}
-    parts = without_added({"demo": chosen, "task": asdict(task)})
+    parts = without_added({"demo": chosen, "task": asdict(task)}, drop=NO_EFFECT)
     identity = json.dumps([parts["demo"], parts["task"], expert], sort_keys=True)
     return hashlib.sha256(identity.encode()).hexdigest()[:12]
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import time
+import warnings
 from collections import deque
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Concatenate, NamedTuple, ParamSpec
@@ -29,6 +30,7 @@ from giril_rl.training.interrupt import Interrupt, Interrupted
 from giril_rl.training.restoring import restoring
 from giril_rl.training.threads import made_on_one_thread
 from giril_rl.training.traced import TracedGradients
+from giril_rl.transforms.scaling import ReturnScaling
 
 if TYPE_CHECKING:
     from giril_rl.training.reward_learner import RewardLearner
@@ -40,10 +42,11 @@ NO_FAILURE = "no_failure"
 
 
 class Trained(NamedTuple):
-    """How long a training was."""
+    """How long a training was, and how often it was resumed without its running episodes."""
 
     steps: int
     seconds: float
+    inexact_resumes: int = 0
 
 
 Rest = ParamSpec("Rest")
@@ -83,7 +86,8 @@ def train_ppo(
 
     The environment's own reward is read for the log, before ``relabel`` replaces it, and by
     nothing that reaches the learner. Checkpoints hold everything that the rest of the run depends
-    on, the simulators' state included, so that an interrupted run ends with the same weights.
+    on, the simulators' state included, so that an interrupted run ends with the same weights. Where
+    a simulator does not repeat itself, the run goes on from fresh episodes, and says so.
 
     Args:
         env: the training environments; closed at the end, however that comes.
@@ -103,7 +107,7 @@ def train_ppo(
         use: what the random numbers are for: "training", or "player" for an expert.
 
     Returns:
-        Environment steps and seconds, those of earlier processes included.
+        Environment steps, seconds and inexact resumes, those of earlier processes included.
 
     Raises:
         Interrupted: after a checkpoint, if the user asked for it with Ctrl-C.
@@ -114,16 +118,18 @@ def train_ppo(
     tracker = EpisodeTracker(cfg.num_envs)
     recent: deque[float] = deque(maxlen=20)
     parts = nn.ModuleDict({"agent": agent, "tracker": tracker, "relabel": relabel})
-    taken = 0
+    taken, inexact, exact = 0, 0, True
     saved = run.load(phase)
     if saved is not None:
         with restoring(run, phase):
             taken = saved["steps"]
+            inexact = saved.get("inexact_resumes", 0)  # Not in those of earlier versions.
             recent.extend(saved["recent"])
             if taken >= steps or saved["stopped"]:
                 parts.load_state_dict(saved["parts"])
-                return Trained(taken, saved["seconds"])
-            env.restore_simulator(saved["simulator"])
+                return Trained(taken, saved["seconds"], inexact)
+            exact = env.restore_simulator(saved["simulator"])
+            inexact += not exact
     batch_size = cfg.num_envs * cfg.rollout
     collector = Collector(
         env,
@@ -146,6 +152,14 @@ def train_ppo(
             if learn_reward is not None:
                 learn_reward.load_state_dict(saved["reward_learner"])
             restore_rng(saved["rng"])
+    if not exact:
+        warnings.warn(
+            "the simulator did not come back to where it was saved (it does not repeat itself, or "
+            f"is another version): this run goes on at {taken:,} steps from fresh episodes, which "
+            "result.json counts in inexact_resumes.",
+            stacklevel=2,
+        )
+        forget_episodes(parts)
     run.truncate_metrics(phase, taken)
     next_save = (taken // cfg.checkpoint_every + 1) * cfg.checkpoint_every
     stopped = False
@@ -192,6 +206,7 @@ def train_ppo(
                 state = {
                     "steps": taken,
                     "seconds": time.perf_counter() - began,
+                    "inexact_resumes": inexact,
                     "stopped": stopped,
                     "recent": list(recent),
                     "parts": dict(parts.state_dict()),
@@ -206,7 +221,17 @@ def train_ppo(
     if interrupt.requested:  # At the end as well, for the run may have more to do.
         whose = "player" if run.recipe == "expert" else "policy"
         raise Interrupted.at(taken, steps, part=f"the {whose}'s training", most=stop_at is not None)
-    return Trained(taken, time.perf_counter() - began)
+    return Trained(taken, time.perf_counter() - began, inexact)
+
+
+def forget_episodes(parts: nn.Module) -> None:
+    """Clears the sums over running episodes, whose rest is lost."""
+    for part in parts.modules():
+        if isinstance(part, EpisodeTracker):
+            part.running_return.zero_()
+            part.running_length.zero_()
+        elif isinstance(part, ReturnScaling) and part.reset_rule == "done":
+            part.running_return.zero_()
 
 
 class PPOLearner:

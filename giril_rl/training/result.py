@@ -89,6 +89,7 @@ def finish_run(
         **scores,
         "wall_seconds": run.fit_seconds + trained.seconds,
         "fit_seconds": run.fit_seconds,
+        "inexact_resumes": trained.inexact_resumes,
         "steps_per_second": trained.steps / max(trained.seconds, 1e-9),
         "expert_return_mean": None if expert is None else expert["return_mean"],
         "demo_return_mean": _mean_return(demo) if demo is not None and demo.has_rewards else None,

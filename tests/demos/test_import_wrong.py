@@ -134,9 +134,9 @@ CASES = {
         lambda: columns(action=np.full(5, 2**64 - 1, np.uint64)),
         "no task has so many",
     ),
-    "columns: integers for numbers": (
-        lambda: columns(observation=lambda x: x.astype(np.int32)),
-        "observation of int32 and shape [5, 3]: vectors must be float32",
+    "columns: images without channels": (
+        lambda: columns(observation=np.zeros((5, 8, 8), np.uint8)),
+        "observation of uint8 and shape [5, 8, 8]: vectors must be [N, d], images uint8 [N, c, h,",
     ),
     "columns: flags of numbers": (
         lambda: columns(terminated=lambda x: x.astype(np.float32)),

@@ -70,7 +70,7 @@ def test_the_demonstration_is_found_and_never_made(made, tmp_path, monkeypatch):
     monkeypatch.setattr(fitted, "config_hash", lambda _: made_by)
     assert find_demonstration(folder, tmp_path) is None
     assert {path.name for path in tmp_path.iterdir()} == {"giril"}
-    place = tmp_path / expert.demonstration_place(cfg.task, cfg.demo, made_by)
+    place = tmp_path / expert.demonstration_place(cfg, cfg.demo, made_by)
     Demonstration(transitions()).save(place)
     found = find_demonstration(folder, tmp_path)
     assert torch.equal(found.transitions["observation"], transitions()["observation"])
@@ -93,7 +93,7 @@ def test_a_demonstration_or_an_expert_may_be_given_by_its_path(made, tmp_path):
     assert len(find_demonstration(folder, tmp_path)) == 6
     shutil.rmtree(tmp_path / "giril")
     folder, cfg = made("giril", f"expert.path={tmp_path}/expert")
-    place = tmp_path / expert.demonstration_place(cfg.task, cfg.demo, "ba9876543210")
+    place = tmp_path / expert.demonstration_place(cfg, cfg.demo, "ba9876543210")
     (tmp_path / "given").rename(tmp_path / "moved")
     Demonstration.load(tmp_path / "moved").save(place)
     assert find_demonstration(folder, tmp_path) is None
@@ -107,7 +107,7 @@ def test_a_relative_root_is_found_from_any_current_directory(made, tmp_path, mon
     folder, cfg = made("giril")
     set_to(folder, "root", "study/mine")
     made_by = config_hash(expert.expert_settings(cfg, cfg.expert))
-    place = expert.demonstration_place(cfg.task, cfg.demo, made_by)
+    place = expert.demonstration_place(cfg, cfg.demo, made_by)
     Demonstration(transitions()).save(tmp_path / "study/mine" / place)
     (tmp_path / "giril").rename(tmp_path / "study/giril")
     folder = tmp_path / "study" / folder.relative_to(tmp_path)
@@ -129,9 +129,9 @@ def test_nothing_outside_the_folder_is_read(made, tmp_path, monkeypatch, key, ki
     if key == "expert.path":
         outside.mkdir()
         (outside / "result.json").write_text(json.dumps(RESULT))
-        demo = within / expert.demonstration_place(cfg.task, cfg.demo, RESULT["config_hash"])
+        demo = within / expert.demonstration_place(cfg, cfg.demo, RESULT["config_hash"])
     elif key == "root":
-        demo = outside / expert.demonstration_place(cfg.task, cfg.demo, made_by)
+        demo = outside / expert.demonstration_place(cfg, cfg.demo, made_by)
     Demonstration(transitions()).save(demo)
     (within / "link").symlink_to(outside)
     value = {"absolute": str(outside), "up": "../outside", "link": "link"}[kind]
