@@ -36,7 +36,7 @@ class Finite:
         """Raises RunError if one of ``values`` is NaN or infinite at ``step``."""
         for name, value in values.items():
             if not math.isfinite(value):
-                raise self._error(f"{name} is {value}", step)
+                raise self.error(f"{name} is {value}", step)
 
     def weights(self, module: nn.Module, step: int) -> None:
         """Raises RunError if a parameter of the module is not finite, or a buffer has a NaN.
@@ -45,12 +45,13 @@ class Finite:
         """
         for name, parameter in module.named_parameters():
             if not torch.isfinite(parameter).all():
-                raise self._error(f"{name} has weights that are not finite", step)
+                raise self.error(f"{name} has weights that are not finite", step)
         for name, buffer in module.named_buffers():
             if torch.isnan(buffer).any():
-                raise self._error(f"{name} has statistics that are not numbers", step)
+                raise self.error(f"{name} has statistics that are not numbers", step)
 
-    def _error(self, what: str, step: int) -> RunError:
+    def error(self, what: str, step: int) -> RunError:
+        """What went wrong at ``step``, and what to do about it."""
         return RunError(
             f"{what} at {step:,} of {self.total:,} {self.unit}: give a smaller step size, or look "
             f"at the rewards and observations; what {self.folder} holds was saved before and is "
