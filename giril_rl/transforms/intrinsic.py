@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from torchrl.data import Composite, TensorSpec, Unbounded
 
 from giril_rl.errors import UserError
+from giril_rl.transforms.order import check_order
 from giril_rl.transforms.reward_transform import RewardTransform, copied, find_reward, split_mask
 
 DEFAULT_OUT_KEY: NestedKey = ("next", "intrinsic_reward")
@@ -33,10 +34,11 @@ class IntrinsicReward(RewardTransform):
     stands in the observation spec (zero at reset), because a second reward key would break code
     that expects one; it must then not be among a policy's ``in_keys``.
 
-    In an environment, put it outside a :class:`~torchrl.envs.ParallelEnv`: workers hold copies of
-    the module, which later training of the original does not reach. Copies in the environments of
-    a multi-process collector get new weights by
-    :class:`~giril_rl.transforms.RewardWeightSyncScheme`.
+    In an environment, it stands after all transforms that change observations which it reads, and
+    sees what they make of them; its action is the base environment's. Put it outside a
+    :class:`~torchrl.envs.ParallelEnv`: workers hold copies of the module, which later training of
+    the original does not reach. Copies in the environments of a multi-process collector get new
+    weights by :class:`~giril_rl.transforms.RewardWeightSyncScheme`.
 
     Args:
         module: reads ``(s, a, s')``, e.g. ``"observation"``, ``"action"`` and
@@ -46,8 +48,9 @@ class IntrinsicReward(RewardTransform):
         extrinsic_key: where the true reward goes, without the ``"next"``; None drops it.
 
     Raises:
-        UserError: if the module's keys, the reward's key or the new reward's shape do not fit, or
-            if there is something under ``extrinsic_key`` already.
+        UserError: if the module's keys, the reward's key or the new reward's shape do not fit, if
+            there is something under ``extrinsic_key`` already, or if a later transform changes an
+            observation that the module reads.
 
     Examples:
         >>> from giril_rl.rewards import ConstantReward
@@ -178,6 +181,8 @@ class IntrinsicReward(RewardTransform):
                     "extrinsic_key, so that no true reward is lost, or None to keep no more."
                 )
             observation_spec[self.extrinsic_key] = self._unbounded(rewards)
+        if self.container is not None:
+            check_order(self.container, self, self.module.in_keys, there)
         return observation_spec
 
     def _unbounded(self, reward_spec: Composite) -> TensorSpec:
