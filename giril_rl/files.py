@@ -8,6 +8,7 @@ import glob
 import io
 import json
 import os
+import platform
 import shutil
 import sys
 from collections.abc import Iterable
@@ -141,6 +142,20 @@ def csv_text(columns: Iterable[str], rows: Iterable[Iterable[Any]]) -> str:
     writer.writerow(columns)
     writer.writerows(rows)
     return text.getvalue()
+
+
+def processor() -> str:
+    """The processor's name, as the system tells it.
+
+    Examples:
+        >>> bool(processor())
+        True
+    """
+    with contextlib.suppress(OSError):
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine() or "unknown"
 
 
 def installed_versions() -> dict[str, str | None]:

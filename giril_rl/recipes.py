@@ -67,6 +67,7 @@ class Recipe:
 
     def load(self) -> ModuleType:
         """Run the recipe's file as a module and check that it has ``Config`` and ``main``."""
+        self._check_names()
         name = f"giril_recipe_{self.name}"
         spec = importlib.util.spec_from_file_location(name, self.path)
         if not self.docstring or spec is None or spec.loader is None:
@@ -81,6 +82,26 @@ class Recipe:
         if not callable(getattr(module, "main", None)):
             raise UserError(f"{self.path} has no `main(cfg, out)`.")
         return module
+
+    def _check_names(self) -> None:
+        """Refuse a file whose runs would be taken for another recipe's."""
+        tree = ast.parse(self.path.read_text("utf-8") if self.docstring else "")
+        for node in ast.walk(tree):
+            words = {word.arg: word.value for word in getattr(node, "keywords", ())}
+            match node:
+                case ast.Call(ast.Attribute(attr="open")):
+                    name = words.get("recipe")
+                    wrong = isinstance(name, ast.Constant) and name.value != self.name
+                    instead = "write recipe=Path(__file__).stem"
+                case ast.Call(ast.Name("finish_run")):
+                    wrong, instead = "method" in words, "delete method="
+                case _:
+                    continue
+            if wrong:
+                raise UserError(
+                    f"{self.path}, line {node.lineno}: a run has the name of its recipe's file, "
+                    f"{self.name}: {instead}."
+                )
 
     def check_config(self, config: Any) -> type[Any]:
         """``config`` itself, refused unless it is a dataclass of RunConfig."""
@@ -110,7 +131,8 @@ def find(text: str) -> Recipe:
         text: a name such as ``giril`` or a path that ends in ``.py``.
 
     Raises:
-        UserError: for an unknown name, a missing file, or a file without its YAML.
+        UserError: for an unknown name, a missing file, a file without its YAML, or one with the
+            name of a shipped recipe.
 
     Examples:
         >>> find("girl")
@@ -118,6 +140,7 @@ def find(text: str) -> Recipe:
         ...
         giril_rl.errors.UserError: 'girl' is not a recipe; did you mean 'giril'?
     """
+    by_name = {recipe.name: recipe for recipe in shipped()}
     if text.endswith(".py"):
         path = Path(text)
         if not path.is_file():
@@ -125,8 +148,14 @@ def find(text: str) -> Recipe:
         settings = path.with_suffix(".yaml")
         if not settings.is_file():
             raise UserError(f"{text} needs its settings in {settings}: `giril cp` copies both.")
-        return Recipe(text, path.resolve(), settings.resolve())
-    by_name = {recipe.name: recipe for recipe in shipped()}
+        found = Recipe(text, path.resolve(), settings.resolve())
+        own = by_name.get(found.name.partition(":")[0])
+        if own is not None and own.path.resolve() != found.path:
+            raise UserError(
+                f"{text} has the name of the recipe {own.name}, whose runs its own would be "
+                "taken for: rename both files."
+            )
+        return found
     if text not in by_name:
         hint = did_you_mean(text, by_name) or f": choose one of {', '.join(by_name)}."
         raise UserError(f"{text!r} is not a recipe{hint}")

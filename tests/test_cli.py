@@ -185,6 +185,25 @@ def test_copy_runs_with_its_own_changed_default(capsys, fake, monkeypatch):
     assert kept["steps"] == 1_000_000
 
 
+def test_a_copy_whose_runs_would_have_another_recipes_name_is_refused(capsys, fake):
+    assert main(["cp", "giril", "gail.py"]) == main(["cp", "control", "mine.py"]) == 0
+    assert refused(capsys_cleared(capsys), "run", "gail.py") == (
+        "gail.py has the name of the recipe gail, whose runs its own would be taken for: rename "
+        "both files."
+    )
+    text = Path("mine.py").read_text()
+    for new, instead in (
+        ('Run.open(out, recipe="control")', "write recipe=Path(__file__).stem"),
+        ("finish_run(run, method=text)", "delete method="),
+    ):
+        Path("mine.py").write_text(f"{text}\n\ndef other(run, out, text):\n    {new}\n")
+        line = len(text.splitlines()) + 4
+        assert refused(capsys, "run", "mine.py") == (
+            f"{Path('mine.py').resolve()}, line {line}: a run has the name of its recipe's file, "
+            f"mine: {instead}."
+        )
+
+
 def capsys_cleared(capsys):
     capsys.readouterr()
     return capsys

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -59,11 +58,13 @@ class LocalLauncher:
 
     def interrupt(self) -> None:
         """Ask all runs to save their state and stop."""
-        self._send(self._gently)
+        for _, process in self._running.values():
+            process.send_signal(self._gently)
 
     def kill(self) -> None:
         """Stop all runs at once."""
-        self._send(signal.SIGKILL)
+        for _, process in self._running.values():
+            process.kill()
 
     def close(self) -> None:
         """Nothing is left running."""
@@ -76,7 +77,3 @@ class LocalLauncher:
     def _forget(self, process: subprocess.Popen[bytes]) -> None:
         if process.stdin is not None:
             process.stdin.close()
-
-    def _send(self, number: signal.Signals) -> None:
-        for _, process in self._running.values():
-            process.send_signal(number)

@@ -6,7 +6,6 @@ import contextlib
 import importlib.util
 import logging
 import os
-import signal
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +13,8 @@ from giril_rl.errors import INTERRUPTED, UserError
 from giril_rl.study.logs import begin_log
 from giril_rl.study.plan import StudyRun
 
-KILLED = -int(signal.SIGKILL)
-"""The code of a run whose worker is gone."""
+KILLED = -9
+"""The code of a run whose worker is gone: that of SIGKILL, which Windows does not name."""
 
 
 class RayLauncher:

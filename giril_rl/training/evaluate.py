@@ -13,7 +13,8 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from giril_rl.configs import TaskConfig
 from giril_rl.envs import for_scores, make_env
-from giril_rl.randomness import seeded
+from giril_rl.networks.agents import check_actions
+from giril_rl.randomness import Use, seeded, stream_seed
 
 
 class Player(Protocol):
@@ -51,6 +52,7 @@ def evaluate(
     episodes: int,
     seed: int,
     deterministic: bool,
+    use: Use = "evaluation",
 ) -> Scores:
     """Plays each of ``episodes`` fresh environments for exactly one episode.
 
@@ -64,9 +66,13 @@ def evaluate(
         episodes: number of episodes.
         seed: root of the episodes' seeds and seed of the sampled actions.
         deterministic: play the distribution's mode rather than samples.
+        use: what the episodes are for.
 
     Returns:
         The scores; the standard deviation is the sample's (n - 1), 0 for one episode.
+
+    Raises:
+        UserError: if the agent was made for other actions than the task's.
 
     Examples:
         >>> from giril_rl.networks.policy import ActorCritic
@@ -78,7 +84,8 @@ def evaluate(
         >>> scores.episodes, scores.return_mean == scores.episode_length_mean
         (5, True)
     """
-    env = make_env(for_scores(task), episodes, seed)
+    env = make_env(for_scores(task), episodes, seed, use=use)
+    check_actions(agent, env)
     policy = agent.acting()
     mode = ExplorationType.DETERMINISTIC if deterministic else ExplorationType.RANDOM
     returns = torch.zeros(episodes, dtype=torch.float64)
@@ -86,7 +93,7 @@ def evaluate(
     playing = torch.ones(episodes, dtype=torch.bool)
     lives = 0
     device = getattr(agent, "device", torch.device("cpu"))
-    with seeded(seed, device), torch.no_grad(), set_exploration_type(mode):
+    with seeded(stream_seed(use, seed), device), torch.no_grad(), set_exploration_type(mode):
         tensordict = env.reset()
         while playing.any():
             tensordict, following = env.step_and_maybe_reset(policy(tensordict))

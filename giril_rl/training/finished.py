@@ -108,9 +108,9 @@ def evaluate_run(folder: Path, episodes: int | None = None, seed: int | None = N
     task, settings = read_settings(folder)
     check_place(folder, "folder, such as a copy of it")
     agent: Player
-    if result["method"] == RANDOM:
+    if result.get("random_policy") or result["method"] == RANDOM:
         agent = RandomPolicy.of_task(task, result["seed"])
-    elif result["method"] == HELD_ACTION:
+    elif "held_action" in result or result["method"] == HELD_ACTION:
         agent = HeldAction.of_task(task, result.get("held_action", -1))
     else:
         agent = load_agent(folder, task)

@@ -12,7 +12,7 @@ from torchrl.objectives import LossModule
 
 from giril_rl.configs import FitConfig
 from giril_rl.progress import progress
-from giril_rl.randomness import restore_rng, rng_state, seeded
+from giril_rl.randomness import restore_rng, rng_state, seeded, stream_seed
 from giril_rl.rewards.chunks import PIXELS_AT_ONCE
 from giril_rl.training.finite import Finite
 from giril_rl.training.interrupt import Interrupt, Interrupted
@@ -60,8 +60,8 @@ def fit_reward(
     data = data.to(device)
     held_out = None if held_out is None else held_out.to(device)
     columns = [data.get(key).contiguous() for key in keys]
-    generator = torch.Generator().manual_seed(seed)
-    torch.manual_seed(seed)
+    generator = torch.Generator().manual_seed(stream_seed("reward", seed))
+    torch.manual_seed(stream_seed("reward", seed))
     step, seconds = 0, 0.0
     saved = run.load(phase)
     if saved is not None:

@@ -92,7 +92,7 @@ class Run:
         check_place(Path(folder), "out=")
         run = cls(Path(folder), config, recipe, logger)
         run._refuse_foreign_folder()
-        check_run_format(run.folder)
+        check_run_format(run.folder, [RUN_FORMAT])
         try:
             run.folder.mkdir(parents=True, exist_ok=True)
             run._lock.acquire(blocking=False)

@@ -6,6 +6,7 @@ import torch
 from giril_rl.configs import TaskConfig
 from giril_rl.envs import make_env
 from giril_rl.networks.policy import ActorCritic
+from giril_rl.randomness import stream_seed
 from giril_rl.training.evaluate import evaluate, evaluate_both
 
 COUNTER = TaskConfig(name="counter", env_id="StepCounter-v0")
@@ -32,7 +33,7 @@ def test_scores_are_those_of_one_whole_episode_in_each_environment(task):
     returns, lengths = [], []
     for i in range(12):
         env = gymnasium.make(task.env_id, disable_env_checker=True)
-        seed = int(np.random.SeedSequence([4, i, 0]).generate_state(1)[0])
+        seed = stream_seed("evaluation", 4, i, 0, bits=32)
         observation, done, total, length = env.reset(seed=seed)[0], False, 0.0, 0
         while not done:
             with torch.no_grad():

@@ -138,7 +138,7 @@ def test_training_a_discriminator(cls, loss, penalty, kind):
 def test_a_step_of_ppo(kind):
     agent = agent_for(kind)
     learner = PPOLearner(agent, PPOConfig(clip_value=True, entropy_coef=0.01), total_steps=8)
-    rows = {"action": transitions(kind, 8)["action"], agent.input_keys[0]: torch.randn(8, 3)}
+    rows = {agent.drawn_key: transitions(kind, 8)["action"], agent.input_keys[0]: torch.randn(8, 3)}
     if kind == "pixels":
         rows[agent.input_keys[0]] = agent.actor.deal(observations(kind, 8))
     scalars = ("advantage", "value_target", "state_value")
@@ -154,9 +154,11 @@ def test_a_step_of_ppo(kind):
 @pytest.mark.parametrize("termination", ["ends", "bootstrap"])
 def test_acting_relabelling_and_learning(kind, termination, monkeypatch):
     """A batch as :func:`giril_rl.training.train_ppo` goes through it."""
-    monkeypatch.setattr("giril_rl.transforms.scaling._finite", lambda value: True)  # Once a batch.
     # TorchRL asks once a batch whether an observation is NaN, and would copy it.
     monkeypatch.setattr(GAE, "_sanitize_next_obs_nan", staticmethod(lambda data, in_keys: data))
+    # As do the running normalisation and the scaling of returns.
+    monkeypatch.setattr("giril_rl.networks.normalise._check_finite", lambda observation: None)
+    monkeypatch.setattr("giril_rl.transforms.scaling._finite", lambda value: True)
     agent = agent_for(kind)
     reward = made(GenerativeReward, kind).eval()
     relabel = Compose(IntrinsicReward(reward), BatchMeanReward(), ReturnScaling())
