@@ -31,7 +31,7 @@ from giril_rl.training.restoring import restoring
 from giril_rl.training.threads import made_on_one_thread
 from giril_rl.training.traced import TracedGradients
 from giril_rl.transforms.batch_mean import BatchMeanReward
-from giril_rl.transforms.scaling import ReturnScaling
+from giril_rl.transforms.scaling import NonFiniteReward, ReturnScaling
 
 if TYPE_CHECKING:
     from giril_rl.training.reward_learner import RewardLearner
@@ -194,7 +194,12 @@ def train_ppo(
                 batch = batch.to(agent.device)
             finite.observations(batch, taken + batch_size)
             learned = {} if learn_reward is None else learn_reward.update(batch)
-            losses = learner.learn(relabel(batch), taken)
+            finite.losses(learned, taken + batch_size)  # Before its reward is used.
+            try:
+                batch = relabel(batch)
+            except NonFiniteReward as error:
+                raise finite.error(error.what, taken + batch_size, "data") from error
+            losses = learner.learn(batch, taken)
             taken += batch_size
             metrics = {f"{phase}/{k}": v for k, v in losses.items()}
             metrics.update(learned)
@@ -207,7 +212,6 @@ def train_ppo(
                 true_return = f"{metrics['train/return_mean']:,.1f}"
             bar.update(batch_size, true_return=true_return)
             run.log(taken, metrics, phase=phase)
-            finite.losses(learned, taken)
             finite.losses(losses, taken, batch.select(("next", "reward")))
             if stop_at is not None and len(recent) == recent.maxlen:
                 stopped = sum(recent) / len(recent) >= stop_at
