@@ -67,7 +67,7 @@ class Recipe:
 
     def load(self) -> ModuleType:
         """Run the recipe's file as a module and check that it has ``Config`` and ``main``."""
-        self._check_names()
+        self._check_name()
         name = f"giril_recipe_{self.name}"
         spec = importlib.util.spec_from_file_location(name, self.path)
         if not self.docstring or spec is None or spec.loader is None:
@@ -83,24 +83,18 @@ class Recipe:
             raise UserError(f"{self.path} has no `main(cfg, out)`.")
         return module
 
-    def _check_names(self) -> None:
-        """Refuse a file whose runs would be taken for another recipe's."""
+    def _check_name(self) -> None:
+        """Refuse a file, such as an early copy, whose runs would be called as another recipe's."""
         tree = ast.parse(self.path.read_text("utf-8") if self.docstring else "")
         for node in ast.walk(tree):
-            words = {word.arg: word.value for word in getattr(node, "keywords", ())}
-            match node:
-                case ast.Call(ast.Attribute(attr="open")):
-                    name = words.get("recipe")
-                    wrong = isinstance(name, ast.Constant) and name.value != self.name
-                    instead = "write recipe=Path(__file__).stem"
-                case ast.Call(ast.Name("finish_run")):
-                    wrong, instead = "method" in words, "delete method="
-                case _:
-                    continue
-            if wrong:
+            if not isinstance(node, ast.Call) or not isinstance(node.func, ast.Attribute):
+                continue
+            words = {word.arg: word.value for word in node.keywords}
+            name = words.get("recipe") if node.func.attr == "open" else None
+            if isinstance(name, ast.Constant) and name.value != self.name:
                 raise UserError(
-                    f"{self.path}, line {node.lineno}: a run has the name of its recipe's file, "
-                    f"{self.name}: {instead}."
+                    f"{self.path}, line {name.lineno}: its runs would be called {name.value!r}, "
+                    f"not {self.name!r} as the file: write recipe=Path(__file__).stem."
                 )
 
     def check_config(self, config: Any) -> type[Any]:

@@ -192,16 +192,12 @@ def test_a_copy_whose_runs_would_have_another_recipes_name_is_refused(capsys, fa
         "both files."
     )
     text = Path("mine.py").read_text()
-    for new, instead in (
-        ('Run.open(out, recipe="control")', "write recipe=Path(__file__).stem"),
-        ("finish_run(run, method=text)", "delete method="),
-    ):
-        Path("mine.py").write_text(f"{text}\n\ndef other(run, out, text):\n    {new}\n")
-        line = len(text.splitlines()) + 4
-        assert refused(capsys, "run", "mine.py") == (
-            f"{Path('mine.py').resolve()}, line {line}: a run has the name of its recipe's file, "
-            f"mine: {instead}."
-        )
+    Path("mine.py").write_text(text.replace("recipe=Path(__file__).stem", 'recipe="control"'))
+    line = text[: text.index("recipe=Path")].count("\n") + 1
+    assert refused(capsys, "run", "mine.py") == (
+        f"{Path('mine.py').resolve()}, line {line}: its runs would be called 'control', not "
+        "'mine' as the file: write recipe=Path(__file__).stem."
+    )
 
 
 def capsys_cleared(capsys):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from datetime import UTC, datetime
 from typing import Any
 
@@ -48,6 +49,7 @@ def finish_run(
     agent: Agent | RandomPolicy | HeldAction,
     trained: Trained,
     *,
+    method: str | None = None,
     expert: dict[str, Any] | None = None,
     demo: Demonstration | None = None,
     seeds: dict[str, int] | None = None,
@@ -61,6 +63,7 @@ def finish_run(
         agent: the trained policy; or one that was not trained, of which nothing is saved but the
             number of the action that it holds.
         trained: its steps and seconds.
+        method: deprecated and not read, for a run's method is the recipe's name.
         expert: the expert's result, if there was one.
         demo: the demonstration, if there was one.
         seeds: seeds besides those of policy, evaluation, expert and demonstration.
@@ -69,6 +72,13 @@ def finish_run(
     Returns:
         What ``result.json`` holds.
     """
+    if method is not None:
+        warnings.warn(
+            "finish_run's method= is not read any more: a run's method is the name that "
+            "Run.open(recipe=...) was given.",
+            DeprecationWarning,
+            stacklevel=2,
+        )
     scores = evaluate_both(agent, cfg.task, episodes=cfg.eval.episodes, seed=cfg.eval.seed)
     result: dict[str, Any] = {
         "method": method_name(run.recipe, cfg),
