@@ -52,6 +52,35 @@ def remove_leftovers(path: Path) -> None:
             leftover.unlink()
 
 
+def missing(folder: Path) -> list[Path]:
+    """Those of a folder and the folders above it that are yet to be made, innermost first.
+
+    Examples:
+        >>> import tempfile
+        >>> top = Path(tempfile.mkdtemp())
+        >>> [place.name for place in missing(top / "runs" / "a")]
+        ['a', 'runs']
+    """
+    return [place for place in (folder, *folder.parents) if not place.exists()]
+
+
+def remove_empty(folders: Iterable[Path]) -> None:
+    """Remove folders up to the first one that holds something or cannot be removed.
+
+    Examples:
+        >>> import tempfile
+        >>> top = Path(tempfile.mkdtemp())
+        >>> made = missing(top / "runs" / "a")
+        >>> made[0].mkdir(parents=True)
+        >>> remove_empty([*made, top.parent])
+        >>> top.exists(), list(top.iterdir())
+        (True, [])
+    """
+    with contextlib.suppress(OSError):
+        for folder in folders:
+            folder.rmdir()
+
+
 def sync(path: Path) -> None:
     """Ask the disk to keep ``path``, a file or a folder, through a power cut."""
     if path.is_dir() and os.name == "nt":  # Windows cannot open a folder

@@ -40,7 +40,7 @@ def main(cfg: Config, out: Path) -> None:
         if run.finished:
             return
         demo, expert = obtain_demonstration(cfg, cfg.expert, cfg.demo)
-        env = make_env(cfg.task, 1, cfg.seed)
+        env = run.closing(make_env(cfg.task, 1, cfg.seed))
 
         agent = make_agent(env, cfg.ppo, cfg.seed).to(cfg.device)
         env.close()

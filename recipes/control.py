@@ -63,7 +63,7 @@ def main(cfg: Config, out: Path) -> None:
         demo, expert = None, None
         if cfg.needs_demonstration:
             demo, expert = obtain_demonstration(cfg, cfg.expert, cfg.demo)
-        env = make_env(cfg.task, cfg.ppo.num_envs, cfg.seed)
+        env = run.closing(make_env(cfg.task, cfg.ppo.num_envs, cfg.seed))
 
         reward, seeds = control_reward(cfg, env, demo, run)
 

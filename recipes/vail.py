@@ -52,7 +52,7 @@ def main(cfg: Config, out: Path) -> None:
             return
         demo, expert = obtain_demonstration(cfg, cfg.expert, cfg.demo)
         pairs = subsample(demo, cfg.demo.subsample)
-        env = make_env(cfg.task, cfg.ppo.num_envs, cfg.seed)
+        env = run.closing(make_env(cfg.task, cfg.ppo.num_envs, cfg.seed))
 
         reward_seed = cfg.seed if cfg.reward.seed is None else cfg.reward.seed
         reward = bottleneck_reward(cfg.reward, env, pairs, seed=reward_seed).to(cfg.device)

@@ -38,6 +38,10 @@ class BatchedEnv(EnvBase):
     has_threads = False
     """Whether the simulators run in threads of their own."""
 
+    first_index = 0
+    """The first simulator's number, of which episodes have their seeds; more than 0 where a larger
+    environment is played in parts."""
+
     _last_observation: np.ndarray
 
     def __init__(self, num_envs: int, *, seed: int = 0, use: Use = "training") -> None:
@@ -104,7 +108,7 @@ class BatchedEnv(EnvBase):
         """Begins new episodes where ``mask`` says so; what all simulators then show."""
 
     def _episode_seed(self, index: int) -> int:
-        numbers = (self._root_seed, index, int(self._episode[index]))
+        numbers = (self._root_seed, self.first_index + index, int(self._episode[index]))
         return stream_seed(self._use, *numbers, bits=32)
 
     def _set_seed(self, seed: int | None) -> None:

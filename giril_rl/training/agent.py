@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import closing
 from pathlib import Path
 
 from giril_rl.configs import PPOConfig, TaskConfig
@@ -38,9 +39,8 @@ def load_agent(run: Path, task: TaskConfig) -> Agent:
     if not folder.is_dir():
         raise UserError(f"{run} holds no trained policy: run it to its end first.")
     agent = load_agent_from(folder)
-    env = make_env(task, 1, seed=0)
-    fitting = fits(agent, env)
-    env.close()
+    with closing(make_env(task, 1, seed=0)) as env:
+        fitting = fits(agent, env)
     if not fitting:
         raise UserError(f"{folder} does not fit {task.name}: it belongs to another task's run.")
     return agent

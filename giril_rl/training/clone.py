@@ -120,7 +120,7 @@ def clone_behaviour(
             bar.update(block, loss=f"{losses['fitted']:.3g}")
             metrics = {f"{phase}/{name}/loss": value for name, value in losses.items()}
             run.log(step, metrics, phase=phase)
-            finite.losses(metrics, step)
+            finite.losses(metrics, step, sets["fitted"])
             asked = interrupt.requested
             if step % CHECKPOINT_EVERY < block or step == cfg.steps or asked:
                 seconds = time.perf_counter() - began
@@ -136,7 +136,7 @@ def clone_behaviour(
             if asked:
                 break
     if interrupt.requested:  # At the end as well, for the run may have more to do.
-        raise Interrupted.at(step, cfg.steps, "gradient steps")
+        raise Interrupted.at(step, cfg.steps, "gradient steps", part="behaviour cloning")
     if cfg.stop == "held_out":
         agent.actor.load_state_dict(best["actor"])
     set_deviation(agent, sets["held_out" if cfg.stop == "held_out" else "fitted"], cfg.min_std)

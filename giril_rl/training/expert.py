@@ -23,7 +23,7 @@ from giril_rl.demos import Demonstration, check_demonstration, record_demonstrat
 from giril_rl.demos.task import as_recorded_task, check_environment, spaces_of
 from giril_rl.envs import gym_factory, make_env, with_own_episodes
 from giril_rl.errors import UserError
-from giril_rl.files import remove_leftovers
+from giril_rl.files import missing, remove_empty, remove_leftovers
 from giril_rl.naming import NO_EFFECT, out_folder, safe, without_added
 from giril_rl.networks.agents import Agent
 from giril_rl.randomness import check_device
@@ -58,7 +58,7 @@ def train_expert(cfg: ExpertRunConfig, folder: Path, *, recipe: str = "expert") 
     with Run.open(folder, asdict(cfg), recipe=recipe, logger=cfg.logger) as run:
         if run.finished:
             return read_result(folder)
-        env = make_env(cfg.task, cfg.ppo.num_envs, cfg.seed, use="player")
+        env = run.closing(make_env(cfg.task, cfg.ppo.num_envs, cfg.seed, use="player"))
         agent = make_agent(env, cfg.ppo, cfg.seed, use="player").to(cfg.device)
         relabel = (
             [SignTransform(REWARD)]
@@ -245,7 +245,11 @@ def _player(agent: Agent, *, deterministic: bool) -> Any:
 
 @contextlib.contextmanager
 def made_once(folder: Path, what: str) -> Iterator[None]:
-    """Lets one process make ``folder`` while others that want it wait."""
+    """Lets one process make ``folder`` while others that want it wait.
+
+    Where that is refused, nothing is left behind.
+    """
+    made = missing(folder.parent)
     folder.parent.mkdir(parents=True, exist_ok=True)
     lock = FileLock(str(folder.parent / f".{folder.name}.lock"))
     try:
@@ -253,7 +257,14 @@ def made_once(folder: Path, what: str) -> Iterator[None]:
     except Timeout:
         print(f"waiting for another run that is making the {what} {folder}", file=sys.stderr)
         lock.acquire()
+    refused = False
     try:
         yield
+    except UserError:
+        refused = not folder.exists()
+        raise
     finally:
         lock.release()
+        if refused:
+            Path(lock.lock_file).unlink(missing_ok=True)
+            remove_empty(made)

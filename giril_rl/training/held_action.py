@@ -96,7 +96,13 @@ def held_action_scores(task: TaskConfig, *, episodes: int, seed: int) -> list[fl
         for action in range(count):
             policy = HeldAction(spec, action)
             played = evaluate(
-                policy, task, episodes=episodes, seed=seed, deterministic=True, use="training"
+                policy,
+                task,
+                episodes=episodes,
+                seed=seed,
+                deterministic=True,
+                use="training",
+                show_progress=False,
             )
             scores.append(played.return_mean)
             bar.update(1)

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import time
 import warnings
 from collections import deque
-from typing import TYPE_CHECKING, Any, NamedTuple
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, Concatenate, NamedTuple, ParamSpec
 
 import torch
 from tensordict import TensorDictBase
@@ -29,7 +31,7 @@ from giril_rl.training.restoring import restoring
 from giril_rl.training.threads import made_on_one_thread
 from giril_rl.training.traced import TracedGradients
 from giril_rl.transforms.batch_mean import BatchMeanReward
-from giril_rl.transforms.scaling import ReturnScaling
+from giril_rl.transforms.scaling import NonFiniteReward, ReturnScaling
 
 if TYPE_CHECKING:
     from giril_rl.training.reward_learner import RewardLearner
@@ -57,6 +59,24 @@ class Trained(NamedTuple):
     averaged: bool = False
 
 
+Rest = ParamSpec("Rest")
+
+
+def _closing_env(
+    train: Callable[Concatenate[BatchedEnv, Rest], Trained],
+) -> Callable[Concatenate[BatchedEnv, Rest], Trained]:
+    @functools.wraps(train)
+    def closing(env: BatchedEnv, *args: Rest.args, **kwargs: Rest.kwargs) -> Trained:
+        try:
+            return train(env, *args, **kwargs)
+        finally:
+            if not env.is_closed:  # By the collector.
+                env.close()
+
+    return closing
+
+
+@_closing_env
 def train_ppo(
     env: BatchedEnv,
     agent: Agent,
@@ -80,7 +100,7 @@ def train_ppo(
     a simulator does not repeat itself, the run goes on from fresh episodes, and says so.
 
     Args:
-        env: the training environments; closed at the end.
+        env: the training environments; closed at the end, however that comes.
         agent: policy and value network; where its weights are, batches go and learning happens.
         relabel: a transform or a composition of them, called with each batch ``(num_envs, time)``;
             its ``state_dict`` is checkpointed.
@@ -172,8 +192,14 @@ def train_ppo(
             recent.extend(returns.tolist())
             if agent.device.type != "cpu":
                 batch = batch.to(agent.device)
+            finite.observations(batch, taken + batch_size)
             learned = {} if learn_reward is None else learn_reward.update(batch)
-            losses = learner.learn(relabel(batch), taken)
+            finite.losses(learned, taken + batch_size)  # Before its reward is used.
+            try:
+                batch = relabel(batch)
+            except NonFiniteReward as error:
+                raise finite.error(error.what, taken + batch_size, "data") from error
+            losses = learner.learn(batch, taken)
             taken += batch_size
             metrics = {f"{phase}/{k}": v for k, v in losses.items()}
             metrics.update(learned)
@@ -186,7 +212,7 @@ def train_ppo(
                 true_return = f"{metrics['train/return_mean']:,.1f}"
             bar.update(batch_size, true_return=true_return)
             run.log(taken, metrics, phase=phase)
-            finite.losses({**learned, **losses}, taken)
+            finite.losses(losses, taken, batch.select(("next", "reward")))
             if stop_at is not None and len(recent) == recent.maxlen:
                 stopped = sum(recent) / len(recent) >= stop_at
             asked = interrupt.requested
@@ -210,7 +236,8 @@ def train_ppo(
             if stopped or asked:
                 break
     if interrupt.requested:  # At the end as well, for the run may have more to do.
-        raise Interrupted.at(taken, steps)
+        whose = "player" if run.recipe == "expert" else "policy"
+        raise Interrupted.at(taken, steps, part=f"the {whose}'s training", most=stop_at is not None)
     return Trained(taken, time.perf_counter() - began, inexact, averaged)
 
 

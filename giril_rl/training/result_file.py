@@ -63,6 +63,7 @@ OPTIONAL: dict[str, Check] = {
     "deterministic": _or_none(_mapping),
     "life_length_mean": _or_none(_number),
     "wall_seconds": _or_none(_number),
+    "fit_seconds": _or_none(_number),
     "inexact_resumes": _natural,
     "steps_per_second": _or_none(_number),
     "expert_return_mean": _or_none(_number),

@@ -29,7 +29,7 @@ TINY = [
 RESULT = {
     *("method", "task", "profile", "seed", "seeds", "env_steps", "return_mean", "return_std"),
     *("return_median", "episode_length_mean", "episodes", "returns", "deterministic"),
-    *("wall_seconds", "steps_per_second", "expert_return_mean", "demo_return_mean"),
+    *("wall_seconds", "fit_seconds", "steps_per_second", "expert_return_mean", "demo_return_mean"),
     *("demo_transitions", "config_hash", "versions", "finished_at"),
 }
 
