@@ -19,6 +19,7 @@ from typing import Any
 
 from giril_rl.configs import RunConfig
 from giril_rl.errors import UserError
+from giril_rl.imports import missing, search_in
 from giril_rl.nearest import did_you_mean
 
 
@@ -54,6 +55,17 @@ class Recipe:
         return self.path.stem
 
     @property
+    def is_shipped(self) -> bool:
+        """Whether it is the package's own rather than a copy."""
+        return self.path.parent == shipped_folder()
+
+    @property
+    def folders(self) -> list[Path]:
+        """Where modules of the user's own are looked for, besides installed packages."""
+        here = [Path.cwd()]
+        return here if self.is_shipped else list(dict.fromkeys([self.path.parent, *here]))
+
+    @property
     def docstring(self) -> str:
         """The file's docstring, read without running the file; empty where there is none."""
         try:
@@ -66,7 +78,11 @@ class Recipe:
             raise UserError(f"{self.path} is not Python as UTF-8 text ({error}).") from error
 
     def load(self) -> ModuleType:
-        """Run the recipe's file as a module and check that it has ``Config`` and ``main``."""
+        """Run the recipe's file as a module and check that it has ``Config`` and ``main``.
+
+        Raises:
+            UserError: where it has not, or imports a module that is not there.
+        """
         self._check_name()
         name = f"giril_recipe_{self.name}"
         spec = importlib.util.spec_from_file_location(name, self.path)
@@ -77,7 +93,12 @@ class Recipe:
         module = importlib.util.module_from_spec(spec)
         # Dataclasses look up their module by name when their annotations are read.
         sys.modules[name] = module
-        spec.loader.exec_module(module)
+        if not self.is_shipped:
+            search_in(*self.folders)
+        try:
+            spec.loader.exec_module(module)
+        except ModuleNotFoundError as error:
+            raise missing(str(self.path), error, *self.folders) from error
         self.check_config(getattr(module, "Config", None))
         if not callable(getattr(module, "main", None)):
             raise UserError(f"{self.path} has no `main(cfg, out)`.")

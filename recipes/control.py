@@ -52,7 +52,7 @@ def main(cfg: Config, out: Path) -> None:
             return
         if cfg.reward == "held_action":
             # Chosen in episodes of the training's seed, scored in those of the evaluation's.
-            scores = held_action_scores(cfg.task, episodes=cfg.eval.episodes, seed=cfg.seed)
+            scores = held_action_scores(cfg.task, episodes=cfg.held_episodes, seed=cfg.seed)
             run.truncate_metrics("held_action", -1)
             for action, score in enumerate(scores):
                 run.log(action, {"held_action/return_mean": score}, phase="held_action")

@@ -24,6 +24,7 @@ from giril_rl.demos.task import as_recorded_task, check_environment, spaces_of
 from giril_rl.envs import gym_factory, make_env, with_own_episodes
 from giril_rl.errors import UserError
 from giril_rl.files import missing, remove_empty, remove_leftovers
+from giril_rl.imports import import_modules, modules_of
 from giril_rl.naming import NO_EFFECT, out_folder, safe, without_added
 from giril_rl.networks.agents import Agent
 from giril_rl.randomness import check_device
@@ -110,6 +111,7 @@ def expert_settings(cfg: RunConfig, expert: ExpertConfig) -> ExpertRunConfig:
         ExpertRunConfig(
             task=with_own_episodes(cfg.task),
             root=cfg.root,
+            imports=cfg.imports,
             logger=cfg.logger,
             threads=cfg.threads,
             device=cfg.device,
@@ -123,9 +125,12 @@ def expert_settings(cfg: RunConfig, expert: ExpertConfig) -> ExpertRunConfig:
 def check_task(cfg: RunConfig) -> None:
     """Looks for environment and device, before a run's folder is made.
 
+    The modules that ``cfg`` names are imported.
+
     Raises:
-        UserError: if either is not there.
+        UserError: if any of them is not there.
     """
+    import_modules(modules_of(cfg), Path.cwd())
     check_device(cfg.device)
     gym_factory(cfg.task)
 

@@ -105,7 +105,8 @@ def train_ppo(
         relabel: a transform or a composition of them, called with each batch ``(num_envs, time)``;
             its ``state_dict`` is checkpointed.
         cfg: settings of PPO.
-        steps: environment steps in all, a multiple of ``cfg.num_envs * cfg.rollout``.
+        steps: environment steps in all, rounded up to whole batches of
+            ``cfg.num_envs * cfg.rollout``.
         seed: seeds action sampling and minibatch order.
         run: where metrics and checkpoints go.
         phase: name of the checkpoint and of the metrics.
@@ -125,6 +126,7 @@ def train_ppo(
         RunError: if a loss or a weight is no longer finite; the last checkpoint stays.
     """
     check_actions(agent, env)
+    steps = cfg.whole_batches(steps)
     relabel.to(agent.device)
     learner = PPOLearner(agent, cfg, total_steps=steps, termination=termination)
     tracker = EpisodeTracker(cfg.num_envs)
