@@ -119,15 +119,10 @@ def what_is_missing(panel: Panel) -> str:
 
 def _command(panel: Panel, recipe: str, *words: str) -> str:
     run = panel.rows[0].runs[0]
-    changes = [(k, v) for k, v in (*panel.changes, *panel.shared) if _of_scores(k)]
-    texts = [task_word(run), *(f"{key}={value}" for key, value in changes), *words]
+    texts = [task_word(run), *(f"{key}={value}" for key, value in panel.changes), *words]
     root = run.below.as_posix()
     texts += [f"root={root}"] if root != "runs" else []
     return f"`{shlex.join(['giril', 'run', recipe, *texts])}`"
-
-
-def _of_scores(key: str) -> bool:
-    return key == "termination" or key.startswith(("task.", "eval."))
 
 
 def _seeds(seeds: Sequence[int]) -> list[str]:

@@ -52,13 +52,13 @@ def test_of_one_run_without_a_number_its_row_has_none(made):
 
 
 def test_a_missing_player_is_named_with_the_command_that_has_it(made):
-    words = ("task.horizon=fixed", "eval.episodes=7")
+    words = ("task.horizon=fixed", "termination=bootstrap")
     for seed in (3, 4):
         made("control", *words, f"seed={seed}", score=50.0)
     made("control", *words, "reward=random", score=10.0)
     made("giril", *words, "seed=5", score=50.0, expert_return_mean=None, name="theirs")
     command = (
-        "`giril run bc task=inverted_pendulum task.horizon=fixed eval.episodes=7 "
+        "`giril run bc task=inverted_pendulum task.horizon=fixed termination=bootstrap "
         f"-m seed=0,3,4 root={made.root}`"
     )
     assert what_is_missing(panel(made)) == (
