@@ -183,7 +183,7 @@ class DemoConfig:
     path: str | None = knob(
         None,
         "folder of a demonstration to use; `shipped` takes the package's own, the one of the run's "
-        "seed, `shipped:NAME/2` a given one; null records one; default: task.demonstration",
+        "seed, `shipped:NAME/2` a given one; null records one; the task decides by default",
     )
     length: int | None = knob(
         1000, "transitions to record; null records `episodes` whole episodes", low=1
