@@ -73,9 +73,10 @@ def test_checkpoints_are_read(name):
 
 def test_the_run_is_evaluated_and_reported(here, capsys):
     kept("run")
+    result = read_json(Path("run/result.json"))
     assert main(["eval", "run", "--episodes", "1"]) == 0
     scores = read_json(Path("run/eval.json"))
-    assert scores["deterministic"]["episode_length_mean"] > 0
+    assert scores["deterministic"]["return_mean"] == result["deterministic"]["return_mean"]
     assert main(["report", ".", "--out", "report"]) == 0
     assert "1 finished runs" in capsys.readouterr().out
     assert "CartPole-v1" in Path("report/report.md").read_text()
@@ -91,17 +92,27 @@ def test_the_run_goes_on_from_its_checkpoints(here):
 
 
 def test_a_run_from_before_formats_were_numbered_is_read(here):
-    kept("run")
-    versions = read_json(Path("run/versions.json"))
+    kept("run_of_format_1")
+    versions = read_json(Path("run_of_format_1/versions.json"))
     del versions["format_version"]
-    write_json(Path("run/versions.json"), versions)
-    assert main(["eval", "run", "--episodes", "1"]) == 0
+    write_json(Path("run_of_format_1/versions.json"), versions)
+    assert main(["eval", "run_of_format_1", "--episodes", "1"]) == 0
+
+
+def test_a_run_of_format_1_is_read_and_not_taken_for_todays(here, capsys):
+    kept("run_of_format_1")
+    assert main(["report", ".", "--out", "report"]) == 0
+    assert "1 finished runs" in capsys.readouterr().out
+    assert main(words("out=run_of_format_1")) == 2
+    assert "has run format 1, and this giril_rl reads only 2" in capsys.readouterr().err
 
 
 def test_the_numbers_written_are_those_that_are_promised():
     page = (DATA.parents[1] / "docs/stability.md").read_text()
-    assert read_json(DATA / "run/versions.json")["format_version"] == 1
-    assert "| run folder | 1 |" in page and "| demonstration | 1 of vectors, 2 of images |" in page
+    assert read_json(DATA / "run/versions.json")["format_version"] == 2
+    assert read_json(DATA / "run_of_format_1/versions.json")["format_version"] == 1
+    assert "| run folder | 2; 1 is read, not continued |" in page
+    assert "| demonstration | 1 of vectors, 2 of images |" in page
     numbers = {"run/policy": 1, "scaled_policy": 2}
     for name, number in {"demonstration": 1, "demonstration_of_images": 2, **numbers}.items():
         assert read_json(DATA / name / "card.json")["format_version"] == number
