@@ -96,6 +96,9 @@ class TaskConfig:
         None, "time limit; null takes the one registered for the id (Atari: 27,000)", low=1
     )
     steps: int = knob(1_000_000, "default policy steps for this task", low=1)
+    demonstration: str | None = knob(
+        None, "what demo.path is where neither it nor an expert or a recording is asked for"
+    )
     expert_score: float | None = knob(None, "mean training return at which the expert stops early")
     expert_steps: int = knob(
         5_000_000, "most environment steps of the task's expert (paper: 5M)", low=1
@@ -164,7 +167,7 @@ class ExpertConfig:
     steps: int | None = knob(
         None, "most environment steps of expert training; null takes task.expert_steps", low=1
     )
-    seed: int = knob(0, "seed of the expert, separate from the policy's", low=0)
+    seed: int | None = knob(None, "seed of the expert; null takes the run's seed", low=0)
     stop_early: bool = knob(True, "stop once the mean return reaches task.expert_score")
     path: str | None = knob(None, "folder of a finished expert run to use instead of training one")
 
@@ -179,8 +182,8 @@ class DemoConfig:
 
     path: str | None = knob(
         None,
-        "folder of a demonstration to use instead of recording one; "
-        "`shipped` takes the package's own of the task",
+        "folder of a demonstration to use; `shipped` takes the package's own, the one of the run's "
+        "seed, `shipped:NAME/2` a given one; null records one; the task decides by default",
     )
     length: int | None = knob(
         1000, "transitions to record; null records `episodes` whole episodes", low=1
@@ -192,7 +195,7 @@ class DemoConfig:
         choices=("first", "all"),
     )
     deterministic: bool = knob(True, "play the expert's mean action rather than a sampled one")
-    seed: int = knob(0, "seed of the recorded episodes", low=0)
+    seed: int | None = knob(None, "seed of the recorded episodes; null takes the run's seed", low=0)
     subsample: int = knob(20, "keep 1 in k transitions, fixed once (paper: 20; 1 keeps all)", low=1)
 
 
@@ -221,7 +224,7 @@ class GenerativeConfig:
         "observation rule of the reward model",
         choices=("demo_range", "standardise", "raw", "pixels"),
     )
-    clamp: bool = knob(True, "clamp normalised observations to [-1, 1]")
+    clamp: bool = knob(True, "clamp observations to [-1, 1], those of normalise=raw too")
     hidden: list[int] = knob([100, 100], "hidden layers of encoder and decoder (tanh)", low=1)
     seed: int | None = knob(None, "seed of the reward model; null takes the run's seed", low=0)
 
@@ -278,7 +281,7 @@ class CuriosityConfig:
         "observation rule of the reward model",
         choices=("demo_range", "standardise", "raw", "pixels"),
     )
-    clamp: bool = knob(True, "clamp normalised observations to [-1, 1]")
+    clamp: bool = knob(True, "clamp observations to [-1, 1], those of normalise=raw too")
     hidden: list[int] = knob([100, 100], "layers of the features (tanh); [] takes none", low=1)
     model_hidden: list[int] = knob(
         [100], "hidden layers of inverse and forward model (tanh)", low=1
@@ -313,7 +316,12 @@ class BCConfig:
     lr: float = knob(3e-3, "AdamW step size, decreasing linearly to zero", low=0, low_open=True)
     weight_decay: float = knob(1.0, "AdamW's weight decay, times the step size", low=0)
     min_scale: float = knob(0.07, "smallest deviation that observations are divided by", low=0)
-    min_std: float = knob(0.01, "Box: smallest deviation of sampled actions", low=0, low_open=True)
+    min_std: float = knob(
+        0.01,
+        "Box: smallest deviation of sampled actions, in units of half their range",
+        low=0,
+        low_open=True,
+    )
     log_every: int = knob(
         100, "gradient steps between logged losses, where held-out ones are compared", low=1
     )
@@ -397,7 +405,7 @@ class UnaveragedRunConfig(RunConfig):
 
 
 @dataclass
-class ExpertRunConfig(RunConfig):
+class ExpertRunConfig(UnaveragedRunConfig):
     """What the expert's own recipe takes: PPO on the true reward."""
 
     steps: int = knob(5_000_000, "most environment steps of expert training (paper: 5M)", low=1)

@@ -8,6 +8,7 @@ import glob
 import io
 import json
 import os
+import platform
 import shutil
 import sys
 from collections.abc import Iterable
@@ -49,6 +50,35 @@ def remove_leftovers(path: Path) -> None:
             shutil.rmtree(leftover)
         else:
             leftover.unlink()
+
+
+def missing(folder: Path) -> list[Path]:
+    """Those of a folder and the folders above it that are yet to be made, innermost first.
+
+    Examples:
+        >>> import tempfile
+        >>> top = Path(tempfile.mkdtemp())
+        >>> [place.name for place in missing(top / "runs" / "a")]
+        ['a', 'runs']
+    """
+    return [place for place in (folder, *folder.parents) if not place.exists()]
+
+
+def remove_empty(folders: Iterable[Path]) -> None:
+    """Remove folders up to the first one that holds something or cannot be removed.
+
+    Examples:
+        >>> import tempfile
+        >>> top = Path(tempfile.mkdtemp())
+        >>> made = missing(top / "runs" / "a")
+        >>> made[0].mkdir(parents=True)
+        >>> remove_empty([*made, top.parent])
+        >>> top.exists(), list(top.iterdir())
+        (True, [])
+    """
+    with contextlib.suppress(OSError):
+        for folder in folders:
+            folder.rmdir()
 
 
 def sync(path: Path) -> None:
@@ -141,6 +171,20 @@ def csv_text(columns: Iterable[str], rows: Iterable[Iterable[Any]]) -> str:
     writer.writerow(columns)
     writer.writerows(rows)
     return text.getvalue()
+
+
+def processor() -> str:
+    """The processor's name, as the system tells it.
+
+    Examples:
+        >>> bool(processor())
+        True
+    """
+    with contextlib.suppress(OSError):
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine() or "unknown"
 
 
 def installed_versions() -> dict[str, str | None]:

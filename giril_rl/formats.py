@@ -9,8 +9,11 @@ from typing import Any
 from giril_rl.errors import UserError
 from giril_rl.files import read_json
 
-RUN_FORMAT = 1
-"""Of a run's folder. Folders without a number are from before it was written down, and are 1."""
+RUN_FORMAT = 2
+"""Of a run's folder. Folders without a number are from before it was written down, and are 1.
+
+Format 1 had the same files, made with other random numbers: it can be read, not continued.
+"""
 
 
 def check_format(found: Any, readable: Collection[int], *, where: str, older: str) -> None:
@@ -45,8 +48,12 @@ def check_format(found: Any, readable: Collection[int], *, where: str, older: st
     raise UserError(f"{where} {found!r}, and this giril_rl reads only {known}: {older}.")
 
 
-def check_run_format(folder: Path) -> None:
+def check_run_format(folder: Path, readable: Collection[int] = (1, RUN_FORMAT)) -> None:
     """Refuses a run's folder of another format, by its ``versions.json``.
+
+    Args:
+        folder: the run's folder.
+        readable: the formats that will do.
 
     Raises:
         UserError: in one sentence.
@@ -54,8 +61,8 @@ def check_run_format(folder: Path) -> None:
     path = folder / "versions.json"
     if path.is_file():
         check_format(
-            read_json(path).get("format_version", RUN_FORMAT),
-            [RUN_FORMAT],
+            read_json(path).get("format_version", 1),
+            readable,
             where=f"{folder} has run format",
             older="use the version that made it, or make the run anew",
         )

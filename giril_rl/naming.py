@@ -20,6 +20,7 @@ NO_EFFECT = frozenset(
         *("ppo.compile", "fit.compile", "reward.compile"),
         *("ppo.checkpoint_every", "fit.log_every"),
         *("eval.episodes", "eval.seed"),
+        "task.demonstration",  # It acts through demo.path.
     }
 )
 """Keys that change where, how fast and how closely watched a run is made, and not what it is a run
@@ -29,6 +30,8 @@ On another device, or compiled, rounding differs and random numbers are others, 
 distribution. A policy may be scored again in any other way, see
 :func:`giril_rl.training.finished.score_anew`.
 """
+EDITION = 2
+"""Counts up where the same settings give other numbers than before; part of every hash."""
 _LONGEST = 80
 ADDED = {
     "task.expert_steps": 5_000_000,
@@ -77,8 +80,8 @@ def without_added(
 def config_hash(config: Any) -> str:
     """Twelve hex digits of the configuration, less what cannot change a result.
 
-    sha256 of the resolved configuration as JSON with sorted keys, without :data:`NO_EFFECT` and
-    without later keys at the value they had before they existed.
+    sha256 of :data:`EDITION` and of the resolved configuration as JSON with sorted keys, without
+    :data:`NO_EFFECT` and without later keys at the value they had before they existed.
 
     Args:
         config: an instance of a recipe's ``Config``.
@@ -89,7 +92,8 @@ def config_hash(config: Any) -> str:
         True
     """
     values = without_added(asdict(config), drop=NO_EFFECT)
-    return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:12]
+    text = json.dumps([EDITION, values], sort_keys=True)
+    return hashlib.sha256(text.encode()).hexdigest()[:12]
 
 
 def safe(name: str, *, distinct: bool = False) -> str:

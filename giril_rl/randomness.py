@@ -1,9 +1,11 @@
-"""The state of torch's global generators, of the CPU and of the device that is in use."""
+"""Random numbers: seeds for each use, and the state of torch's global generators."""
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Literal, get_args
 
 import torch
 from torch import Tensor
@@ -11,6 +13,33 @@ from torch import Tensor
 from giril_rl.errors import UserError
 
 CPU = torch.device("cpu")
+Use = Literal["player", "demonstration", "training", "evaluation", "reward"]
+_USES = get_args(Use)
+
+
+def stream_seed(use: Use, *numbers: int, bits: int = 63) -> int:
+    """A seed for one use, never equal to a seed for another use.
+
+    The first three of the seed's bits are the use; the others are hashed from use and numbers. So
+    with the same ``seed`` in a run's settings the player, its demonstration, the policy's training,
+    its evaluation and the reward model all have random numbers and start states of their own.
+
+    Args:
+        use: what the random numbers are for.
+        numbers: what tells the seeds of one use apart, such as a run's seed.
+        bits: size of the seed: 63 for torch, 32 for simulators.
+
+    Examples:
+        >>> uses = ("player", "demonstration", "training", "evaluation", "reward")
+        >>> len({stream_seed(use, seed, bits=32) for use in uses for seed in range(1000)})
+        5000
+        >>> [stream_seed(use, 0, bits=32) >> 29 for use in uses]
+        [0, 1, 2, 3, 4]
+    """
+    text = "/".join(map(str, (use, *numbers)))
+    hashed = int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big")
+    free = bits - 3
+    return _USES.index(use) << free | hashed >> (64 - free)
 
 
 def rng_state(device: torch.device) -> dict[str, Tensor]:

@@ -1,4 +1,4 @@
-"""Settings that a kind of task changes in every recipe: Atari's."""
+"""Settings that a task or its kind changes in every recipe."""
 
 from __future__ import annotations
 
@@ -60,7 +60,10 @@ def apply_task_defaults(config: Any, chosen: Collection[str] = ()) -> Any:
         >>> config.ppo.num_envs, config.ppo.rollout
         (8, 125)
     """
-    for key, value in task_defaults(config.task.env_id, chosen).items():
+    changes = task_defaults(config.task.env_id, chosen)
+    if config.task.demonstration is not None and not _asks_for_a_player(chosen):
+        changes["demo.path"] = config.task.demonstration
+    for key, value in changes.items():
         *parts, name = key.split(".")
         part = config
         for step in parts:
@@ -70,3 +73,11 @@ def apply_task_defaults(config: Any, chosen: Collection[str] = ()) -> Any:
         if is_dataclass(part) and hasattr(part, name):
             setattr(part, name, value)
     return config
+
+
+def _asks_for_a_player(chosen: Collection[str]) -> bool:
+    """Whether somebody chose the demonstration, the expert who gives it, or how it is recorded."""
+    return any(
+        key.startswith("expert.") or (key.startswith("demo.") and key != "demo.subsample")
+        for key in chosen
+    )

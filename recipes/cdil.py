@@ -50,17 +50,18 @@ class Config(RunConfig):
 def main(cfg: Config, out: Path) -> None:
     """Train the whole chain and leave its run folder in ``out``."""
     check_inputs(cfg, cfg.expert, cfg.demo)
-    with Run.open(out, asdict(cfg), recipe="cdil", logger=cfg.logger) as run:
+    with Run.open(out, asdict(cfg), recipe=Path(__file__).stem, logger=cfg.logger) as run:
         if run.finished:
             return
         demo, expert = obtain_demonstration(cfg, cfg.expert, cfg.demo)
-        env = make_env(cfg.task, cfg.ppo.num_envs, cfg.seed)
+        pairs = subsample(demo, cfg.demo.subsample)
+        env = run.closing(make_env(cfg.task, cfg.ppo.num_envs, cfg.seed))
 
         reward_seed = cfg.seed if cfg.reward.seed is None else cfg.reward.seed
-        reward = curiosity_reward(cfg.reward, env, demo, seed=reward_seed).to(cfg.device)
+        reward = curiosity_reward(cfg.reward, env, pairs, seed=reward_seed).to(cfg.device)
         fit_reward(
             CuriosityRewardLoss(reward, features=cast(FeatureTraining, cfg.reward.features)),
-            subsample(demo, cfg.demo.subsample),
+            pairs,
             cfg.fit,
             seed=reward_seed,
             run=run,
@@ -88,7 +89,6 @@ def main(cfg: Config, out: Path) -> None:
             cfg,
             agent,
             trained,
-            method="cdil",
             expert=expert,
             demo=demo,
             reward=reward,

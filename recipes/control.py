@@ -38,7 +38,6 @@ class Config(ControlRunConfig):
 
 def main(cfg: Config, out: Path) -> None:
     """Train a policy on the control reward and leave its run folder in ``out``."""
-    method = f"control:{cfg.reward}"
     if cfg.needs_demonstration:
         check_inputs(cfg, cfg.expert, cfg.demo)
     else:
@@ -48,7 +47,7 @@ def main(cfg: Config, out: Path) -> None:
         player = RandomPolicy.of_task(cfg.task, cfg.seed)
     if cfg.reward == "held_action":
         check_discrete(cfg.task)
-    with Run.open(out, asdict(cfg), recipe="control", logger=cfg.logger) as run:
+    with Run.open(out, asdict(cfg), recipe=Path(__file__).stem, logger=cfg.logger) as run:
         if run.finished:
             return
         if cfg.reward == "held_action":
@@ -59,12 +58,12 @@ def main(cfg: Config, out: Path) -> None:
                 run.log(action, {"held_action/return_mean": score}, phase="held_action")
             player = HeldAction.of_task(cfg.task, scores.index(max(scores)))
         if player is not None:
-            finish_run(run, cfg, player, Trained(0, 0.0), method=method)
+            finish_run(run, cfg, player, Trained(0, 0.0))
             return
         demo, expert = None, None
         if cfg.needs_demonstration:
             demo, expert = obtain_demonstration(cfg, cfg.expert, cfg.demo)
-        env = make_env(cfg.task, cfg.ppo.num_envs, cfg.seed)
+        env = run.closing(make_env(cfg.task, cfg.ppo.num_envs, cfg.seed))
 
         reward, seeds = control_reward(cfg, env, demo, run)
 
@@ -89,7 +88,6 @@ def main(cfg: Config, out: Path) -> None:
             cfg,
             agent,
             trained,
-            method=method,
             expert=expert,
             demo=demo,
             reward=reward,

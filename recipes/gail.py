@@ -47,17 +47,18 @@ class Config(UnaveragedRunConfig):
 def main(cfg: Config, out: Path) -> None:
     """Train the whole chain and leave its run folder in ``out``."""
     check_inputs(cfg, cfg.expert, cfg.demo)
-    with Run.open(out, asdict(cfg), recipe="gail", logger=cfg.logger) as run:
+    with Run.open(out, asdict(cfg), recipe=Path(__file__).stem, logger=cfg.logger) as run:
         if run.finished:
             return
         demo, expert = obtain_demonstration(cfg, cfg.expert, cfg.demo)
-        env = make_env(cfg.task, cfg.ppo.num_envs, cfg.seed)
+        pairs = subsample(demo, cfg.demo.subsample)
+        env = run.closing(make_env(cfg.task, cfg.ppo.num_envs, cfg.seed))
 
         reward_seed = cfg.seed if cfg.reward.seed is None else cfg.reward.seed
-        reward = discriminator_reward(cfg.reward, env, demo, seed=reward_seed).to(cfg.device)
+        reward = discriminator_reward(cfg.reward, env, pairs, seed=reward_seed).to(cfg.device)
         learner = AdversarialLearner(
             DiscriminatorLoss(reward, penalty=cfg.reward.penalty),
-            subsample(demo, cfg.demo.subsample),
+            pairs,
             cfg.reward,
             seed=reward_seed,
         )
@@ -83,7 +84,6 @@ def main(cfg: Config, out: Path) -> None:
             cfg,
             agent,
             trained,
-            method="gail",
             expert=expert,
             demo=demo,
             reward=reward,

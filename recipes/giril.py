@@ -49,17 +49,18 @@ class Config(RunConfig):
 def main(cfg: Config, out: Path) -> None:
     """Train the whole chain and leave its run folder in ``out``."""
     check_inputs(cfg, cfg.expert, cfg.demo)
-    with Run.open(out, asdict(cfg), recipe="giril", logger=cfg.logger) as run:
+    with Run.open(out, asdict(cfg), recipe=Path(__file__).stem, logger=cfg.logger) as run:
         if run.finished:
             return
         demo, expert = obtain_demonstration(cfg, cfg.expert, cfg.demo)
-        env = make_env(cfg.task, cfg.ppo.num_envs, cfg.seed)
+        pairs = subsample(demo, cfg.demo.subsample)
+        env = run.closing(make_env(cfg.task, cfg.ppo.num_envs, cfg.seed))
 
         reward_seed = cfg.seed if cfg.reward.seed is None else cfg.reward.seed
-        reward = generative_reward(cfg.reward, env, demo, seed=reward_seed).to(cfg.device)
+        reward = generative_reward(cfg.reward, env, pairs, seed=reward_seed).to(cfg.device)
         fit_reward(
             GenerativeRewardLoss(reward, alpha=cfg.reward.alpha),
-            subsample(demo, cfg.demo.subsample),
+            pairs,
             cfg.fit,
             seed=reward_seed,
             run=run,
@@ -87,7 +88,6 @@ def main(cfg: Config, out: Path) -> None:
             cfg,
             agent,
             trained,
-            method="giril",
             expert=expert,
             demo=demo,
             reward=reward,

@@ -47,14 +47,15 @@ class Config(UnaveragedRunConfig):
 def main(cfg: Config, out: Path) -> None:
     """Train the whole chain and leave its run folder in ``out``."""
     check_inputs(cfg, cfg.expert, cfg.demo)
-    with Run.open(out, asdict(cfg), recipe="vail", logger=cfg.logger) as run:
+    with Run.open(out, asdict(cfg), recipe=Path(__file__).stem, logger=cfg.logger) as run:
         if run.finished:
             return
         demo, expert = obtain_demonstration(cfg, cfg.expert, cfg.demo)
-        env = make_env(cfg.task, cfg.ppo.num_envs, cfg.seed)
+        pairs = subsample(demo, cfg.demo.subsample)
+        env = run.closing(make_env(cfg.task, cfg.ppo.num_envs, cfg.seed))
 
         reward_seed = cfg.seed if cfg.reward.seed is None else cfg.reward.seed
-        reward = bottleneck_reward(cfg.reward, env, demo, seed=reward_seed).to(cfg.device)
+        reward = bottleneck_reward(cfg.reward, env, pairs, seed=reward_seed).to(cfg.device)
         learner = AdversarialLearner(
             BottleneckLoss(
                 reward,
@@ -63,7 +64,7 @@ def main(cfg: Config, out: Path) -> None:
                 beta=cfg.reward.beta_start,
                 penalty=cfg.reward.penalty,
             ),
-            subsample(demo, cfg.demo.subsample),
+            pairs,
             cfg.reward,
             seed=reward_seed,
         )
@@ -89,7 +90,6 @@ def main(cfg: Config, out: Path) -> None:
             cfg,
             agent,
             trained,
-            method="vail",
             expert=expert,
             demo=demo,
             reward=reward,

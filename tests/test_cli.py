@@ -203,6 +203,21 @@ def test_copy_runs_with_its_own_changed_default(capsys, fake, monkeypatch):
     assert kept["steps"] == 1_000_000
 
 
+def test_a_copy_whose_runs_would_have_another_recipes_name_is_refused(capsys, fake):
+    assert main(["cp", "giril", "gail.py"]) == main(["cp", "control", "mine.py"]) == 0
+    assert refused(capsys_cleared(capsys), "run", "gail.py") == (
+        "gail.py has the name of the recipe gail, whose runs its own would be taken for: rename "
+        "both files."
+    )
+    text = Path("mine.py").read_text()
+    Path("mine.py").write_text(text.replace("recipe=Path(__file__).stem", 'recipe="control"'))
+    line = text[: text.index("recipe=Path")].count("\n") + 1
+    assert refused(capsys, "run", "mine.py") == (
+        f"{Path('mine.py').resolve()}, line {line}: its runs would be called 'control', not "
+        "'mine' as the file: write recipe=Path(__file__).stem."
+    )
+
+
 def capsys_cleared(capsys):
     capsys.readouterr()
     return capsys

@@ -42,7 +42,9 @@ def test_result_is_the_recipes_own_dataclass():
 )
 def test_tasks(task, env_id, steps, score):
     config = config_of(f"task={task}")
-    assert config.task == TaskConfig(task, env_id, None, steps, score)
+    assert config.task == TaskConfig(
+        task, env_id, steps=steps, expert_score=score, demonstration="shipped"
+    )
     assert config.steps == steps
 
 

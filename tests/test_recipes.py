@@ -9,8 +9,11 @@ import sys
 import time
 from pathlib import Path
 
+import gymnasium
+import numpy as np
 import pytest
 import torch
+from gymnasium.envs.classic_control.cartpole import CartPoleEnv
 
 from giril_rl.cli import main
 from giril_rl.envs import GymVectorEnv
@@ -50,7 +53,8 @@ EXTRA = {
 
 SCORES = ["return_mean", "return_std", "return_median", "episode_length_mean", "episodes"]
 FIELDS = [
-    *("method", "task", "seed", "env_steps", *SCORES, "wall_seconds", "steps_per_second"),
+    *("method", "task", "seed", "env_steps", *SCORES),
+    *("wall_seconds", "fit_seconds", "steps_per_second"),
     *("expert_return_mean", "demo_return_mean", "demo_transitions", "config_hash", "versions"),
     "finished_at",
 ]
@@ -104,8 +108,10 @@ def assert_whole(folder, result, recipe, task, steps):
         assert len(scores["returns"]) == scores["episodes"] == 2
         assert scores["return_mean"] == pytest.approx(sum(scores["returns"]) / 2)
         assert scores["episode_length_mean"] >= 1
-    assert result["wall_seconds"] > 0
-    speed = steps / result["wall_seconds"]
+    assert (result["fit_seconds"] > 0) == (recipe in ("giril", "cdil"))
+    trained = result["wall_seconds"] - result["fit_seconds"]
+    assert trained > 0
+    speed = steps / trained
     assert result["steps_per_second"] == pytest.approx(speed)
     assert result["versions"]["torch"] == str(torch.__version__)
     found = [row for row in timeless(folder) if row["phase"] == "ppo"]
@@ -197,7 +203,7 @@ def test_a_run_follows_from_its_seed(recipe, root, tmp_path):
         results[name] = run(recipe, tmp_path / name, root, f"seed={seed}")
     assert timeless(tmp_path / "one") == timeless(tmp_path / "two")
     assert weights(tmp_path / "one") == weights(tmp_path / "two")
-    clock = {"wall_seconds", "steps_per_second", "finished_at"}
+    clock = {"wall_seconds", "fit_seconds", "steps_per_second", "finished_at"}
     one, two = ({k: v for k, v in results[n].items() if k not in clock} for n in ("one", "two"))
     assert one == two
     assert weights(tmp_path / "one") != weights(tmp_path / "three")
@@ -255,9 +261,49 @@ def test_an_interrupted_run_says_so_and_ends_as_an_undisturbed_one(root, tmp_pat
     saved = load_state(tmp_path / "run" / "ppo.safetensors")["steps"]
     # Nothing was lost, not even what came after the last regular checkpoint.
     assert saved == timeless(tmp_path / "run")[-1]["step"]
-    sentence = f"interrupted at {saved:,} of {LONG:,} steps: the same command continues from there"
-    assert error.splitlines()[-1] == f"giril: {sentence}."
+    sentence = f"interrupted in the policy's training at {saved:,} of {LONG:,} steps: the same"
+    assert error.splitlines()[-1] == f"giril: {sentence} command continues from there."
     assert "Traceback" not in error
     run("control", tmp_path / "run", root, steps=LONG)
     assert weights(tmp_path / "run") == weights(tmp_path / "whole")
     assert timeless(tmp_path / "run") == timeless(tmp_path / "whole")
+
+
+class Grid(gymnasium.Env):
+    """Observations that no policy here is for, which is seen once an environment is made."""
+
+    observation_space = gymnasium.spaces.Box(-1, 1, (2, 2), np.float32)
+    action_space = gymnasium.spaces.Discrete(2)
+
+
+@pytest.mark.parametrize("recipe", [*EXTRA, "bc"])
+def test_a_refused_run_leaves_neither_its_folder_nor_its_experts(recipe, tmp_path, capsys):
+    if "Grid-v0" not in gymnasium.registry:
+        gymnasium.register("Grid-v0", entry_point=Grid, max_episode_steps=10)
+    place = [f"out={tmp_path}/runs/a", f"root={tmp_path}/runs", "task.env_id=Grid-v0"]
+    assert main(["run", recipe, "task=gymnasium", "logger=null", *place, "steps=2000"]) == 2
+    assert "vector" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("recipe", ["giril", "gail", "control", "expert"])
+def test_no_simulator_is_left_open(recipe, root, tmp_path, monkeypatch):
+    """Nor where every part is loaded from its checkpoint."""
+    open_now: set[int] = set()
+    made, close = CartPoleEnv.__init__, CartPoleEnv.close
+
+    def counted(self, *args, **kwargs):
+        open_now.add(id(self))
+        made(self, *args, **kwargs)
+
+    def closed(self):
+        open_now.discard(id(self))
+        close(self)
+
+    monkeypatch.setattr(CartPoleEnv, "__init__", counted)
+    monkeypatch.setattr(CartPoleEnv, "close", closed)
+    run(recipe, tmp_path / "run", root)
+    assert open_now == set()
+    (tmp_path / "run" / "result.json").unlink()
+    run(recipe, tmp_path / "run", root)
+    assert open_now == set()

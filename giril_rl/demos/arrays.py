@@ -9,12 +9,13 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
+from giril_rl.demos.names import check_names
 from giril_rl.errors import UserError
 
 NEEDED = ("observation", "action", "next_observation", "terminated", "truncated")
 """One row per transition each; ``reward`` may be there as well."""
 _FLAGS = ("terminated", "truncated")
-_LOSSLESS_ENOUGH = "fiu"  # numpy's kinds: float, signed and unsigned integer
+_NUMBERS = "fiub"  # numpy's kinds: float, signed and unsigned integer, bool
 
 
 def to_transitions(columns: Mapping[str, np.ndarray]) -> TensorDict:
@@ -42,9 +43,7 @@ def to_transitions(columns: Mapping[str, np.ndarray]) -> TensorDict:
         >>> data["episode"].tolist(), data["step"].tolist(), data["next", "reward"].shape
         ([0, 0, 1], [0, 1, 0], torch.Size([3, 1]))
     """
-    for name in NEEDED:
-        if name not in columns:
-            raise UserError(_missing(name))
+    check_names(columns, NEEDED, "the data set has no")
     lengths = {name: len(column) if column.ndim else 0 for name, column in columns.items()}
     length = lengths["action"]
     for name, found in lengths.items():
@@ -138,21 +137,12 @@ def from_episodes(episodes: Iterable[Mapping[str, np.ndarray]]) -> dict[str, np.
         raise UserError(f"the data set's episodes do not fit each other ({error}).") from None
 
 
-def _missing(name: str) -> str:
-    if name == "next_observation":
-        return (
-            "the data set has no next_observation, so next states are missing: give them, or "
-            "observations with one row more than actions in each episode."
-        )
-    return f"the data set has no {name}: needed are {', '.join(NEEDED)}."
-
-
 def _described(array: np.ndarray) -> str:
     return f"{array.dtype} and shape {list(array.shape)}"
 
 
 def _float32(name: str, array: np.ndarray) -> np.ndarray:
-    if array.dtype.kind not in _LOSSLESS_ENOUGH:
+    if array.dtype.kind not in _NUMBERS:
         raise UserError(f"the data set has {name} of {_described(array)}: numbers are needed.")
     with np.errstate(over="ignore"):  # The check of infinities tells where.
         return np.ascontiguousarray(array, dtype=np.float32)
@@ -180,10 +170,10 @@ def _observation(name: str, array: np.ndarray) -> Tensor:
         )
     if array.dtype == np.uint8 and array.ndim == 4:
         return torch.from_numpy(np.array(array, order="C"))
-    if array.dtype.kind != "f" or array.ndim != 2:
+    if array.ndim != 2:
         raise UserError(
-            f"the data set has {name} of {_described(array)}: vectors must be float32 or float64 "
-            "[N, d], images uint8 [N, c, h, w]."
+            f"the data set has {name} of {_described(array)}: vectors must be [N, d], images uint8 "
+            "[N, c, h, w]."
         )
     return torch.from_numpy(_float32(name, array))
 

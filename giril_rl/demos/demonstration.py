@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import shutil
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -24,7 +25,7 @@ FORMAT_VERSION = 1
 IMAGE_FORMAT_VERSION = 2
 """Of images, which lie in a file of their own."""
 
-
+_AT_ONCE = 10_000
 _IMAGES: list[NestedKey] = ["observation", ("next", "observation")]
 
 
@@ -87,6 +88,24 @@ class Demonstration:
     def lengths(self) -> Tensor:
         """Transitions of each episode, int64 [num_episodes]."""
         return torch.bincount(self.transitions["episode"], minlength=self.num_episodes)
+
+    @property
+    def demo_id(self) -> str:
+        """Twelve hex digits of sha256 of the transitions, whatever the card or the storage says.
+
+        Examples:
+            >>> one = Demonstration(TensorDict({"step": torch.arange(3)}, [3]), {"task": "reach"})
+            >>> same = Demonstration(TensorDict({"step": torch.arange(3)}, [3]))
+            >>> one.demo_id == same.demo_id, one.demo_id
+            (True, '...')
+        """
+        digest = hashlib.sha256()
+        for key in sorted(self.transitions.keys(True, True), key=str):
+            values = self.transitions.get(key)
+            digest.update(f"{key}{values.dtype}{tuple(values.shape)}".encode())
+            for part in values.split(_AT_ONCE):
+                digest.update(part.cpu().contiguous().numpy())
+        return digest.hexdigest()[:12]
 
     def save(self, folder: Path | str) -> None:
         """Write ``folder`` at once: a TensorDict memmap of tensors only, and ``card.json``.

@@ -16,11 +16,13 @@ from giril_rl.demos.check import check_demonstration
 from giril_rl.demos.demonstration import Demonstration
 from giril_rl.demos.distinct import DistinctEpisodes
 from giril_rl.demos.replay import as_executed, as_recorded, verify_by_replay
+from giril_rl.envs.checking import check_reset, check_step, env_name
+from giril_rl.envs.spaces import check_action_space
 from giril_rl.envs.stdout import silent_stdout
 from giril_rl.errors import UserError
-from giril_rl.files import installed_versions
+from giril_rl.files import installed_versions, processor
 from giril_rl.progress import progress
-from giril_rl.randomness import seeded
+from giril_rl.randomness import seeded, stream_seed
 
 _LONGEST_EPISODE = 1_000_000
 
@@ -32,7 +34,7 @@ def episode_seed(seed: int, episode: int) -> int:
         >>> len({episode_seed(seed, episode) for seed in range(3) for episode in range(100)})
         300
     """
-    return int(np.random.SeedSequence([seed, episode]).generate_state(1)[0])
+    return stream_seed("demonstration", seed, episode, bits=32)
 
 
 def record_demonstration(
@@ -57,7 +59,7 @@ def record_demonstration(
 
     Args:
         make_fn: makes the Gymnasium environment: flat observation or uint8 images [c, h, w], Box
-            or Discrete actions.
+            or Discrete actions, as :class:`~giril_rl.envs.GymVectorEnv` takes them.
         policy: observation float32 [1, d], or uint8 [1, c, h, w], -> action float [1, a] (Box) or
             int64 [1] (Discrete); it returns is played, so it decides itself between mean and
             sample.
@@ -72,13 +74,15 @@ def record_demonstration(
 
     Returns:
         The demonstration; its card has ``task``, ``env_id``, ``seed``, ``seeds``, ``length``,
-        ``deterministic``, ``expert``, ``versions``, ``transitions`` and ``episode_returns``, a
+        ``deterministic``, ``expert``, ``versions``, ``processor``, ``transitions`` and
+        ``episode_returns``, a
         game's also ``lives``, ``lives_left`` (at each episode's beginning and end) and ``actions``,
         their names.
 
     Raises:
         UserError: unless exactly one of ``length`` and ``episodes`` is positive; for an action that
-            is not finite or not in the space; for an environment that does not repeat.
+            is not finite or not in the space; for an environment that does not repeat, or whose
+            spaces, observations or rewards are not what they should be.
 
     Examples:
         >>> demo = record_demonstration(
@@ -94,7 +98,8 @@ def record_demonstration(
             "least 1, and null for the other."
         )
     env = make_fn()
-    rows: list[dict[str, Any]] = []
+    check_action_space(env.action_space, env_name(env))
+    parts: list[TensorDict] = []
     seeds: list[int] = []
     lives_left: list[list[int]] = []
     distinct, numbers = DistinctEpisodes(episodes or 0), count()
@@ -103,11 +108,11 @@ def record_demonstration(
         with (
             seeded(episode_seed(seed, 0)),
             torch.no_grad(),
-            progress(total or 0, desc="demonstration", unit=unit) as bar,
+            progress(total or 0, desc="demonstration", unit=unit, disable=not show_progress) as bar,
         ):
-            while len(rows) < length if length is not None else len(seeds) < (episodes or 0):
+            while bar.done < (total or 0):
                 own = episode_seed(seed, next(numbers))
-                most = _LONGEST_EPISODE if length is None else length - len(rows)
+                most = _LONGEST_EPISODE if length is None else length - bar.done
                 played, counted = _play(env, policy, own, most)
                 if length is None and not played[-1]["done"]:
                     raise UserError(
@@ -118,11 +123,11 @@ def record_demonstration(
                     continue
                 seeds.append(own)
                 lives_left.append(counted)
-                rows += [{"episode": len(seeds) - 1, "step": i, **r} for i, r in enumerate(played)]
+                parts.append(_stack(played, len(parts)))
                 bar.update(1 if length is None else len(played))
     finally:
         env.close()
-    demo = Demonstration(_stack(rows))
+    demo = Demonstration(TensorDict.cat(parts))
     demo.card = {
         "task": task,
         "env_id": env.spec.id if env.spec is not None else None,
@@ -132,6 +137,7 @@ def record_demonstration(
         "deterministic": deterministic,
         "expert": expert,
         "versions": installed_versions(),
+        "processor": processor(),
         "transitions": len(demo),
         "episode_returns": demo.returns.tolist(),
     }
@@ -153,13 +159,13 @@ def _play(
     """One episode from ``seed``, or its first ``most`` transitions, and lives before and after."""
     rows: list[dict[str, Any]] = []
     with silent_stdout():  # the simulator connects here
-        observation, info = env.reset(seed=seed)
+        observation, info = check_reset(env, env.reset(seed=seed))
     lives = [info.get("lives")]
     before = as_recorded(observation)
     while len(rows) < most:
         action = _choose(policy, before, env.action_space)
-        observation, reward, terminated, truncated, info = env.step(
-            as_executed(action, env.action_space)
+        observation, reward, terminated, truncated, info = check_step(
+            env, env.step(as_executed(action, env.action_space))
         )
         after = as_recorded(observation)
         rows.append(
@@ -200,7 +206,7 @@ def _choose(
     return int(output)
 
 
-def _stack(rows: list[dict[str, Any]]) -> TensorDict:
+def _stack(rows: list[dict[str, Any]], episode: int) -> TensorDict:
     def column(name: str, dtype: torch.dtype | None = None) -> Tensor:
         return torch.as_tensor(np.stack([row[name] for row in rows]), dtype=dtype)
 
@@ -213,8 +219,8 @@ def _stack(rows: list[dict[str, Any]]) -> TensorDict:
         {
             "observation": column("observation"),
             "action": column("action", torch.int64 if discrete else torch.float32),
-            "episode": column("episode", torch.int64),
-            "step": column("step", torch.int64),
+            "episode": torch.full((len(rows),), episode),
+            "step": torch.arange(len(rows)),
             "next": TensorDict(after, [len(rows)]),
         },
         [len(rows)],

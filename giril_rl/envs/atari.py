@@ -11,7 +11,7 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Bounded, Categorical
 
 from giril_rl.envs.atari_game import FRAME_CAP, NOOP, SIDE, SKIP, AtariGame, Shown
-from giril_rl.envs.batched import NOT_REPEATING, BatchedEnv
+from giril_rl.envs.batched import BatchedEnv
 from giril_rl.envs.saved import (
     check_counts,
     check_game_actions,
@@ -20,6 +20,7 @@ from giril_rl.envs.saved import (
     saved_tensor,
 )
 from giril_rl.errors import UserError
+from giril_rl.randomness import Use
 
 Episode = Literal["life", "game"]
 
@@ -61,6 +62,7 @@ class AtariEnv(BatchedEnv):
         num_envs: number of games.
         episode: "life" or "game".
         seed: root of the games' seeds.
+        use: what the episodes are for; those of two uses never have equal seeds.
         frame_cap: emulated frames after which a game is cut (truncated).
 
     Raises:
@@ -82,11 +84,12 @@ class AtariEnv(BatchedEnv):
         *,
         episode: Episode = "life",
         seed: int = 0,
+        use: Use = "training",
         frame_cap: int = FRAME_CAP,
     ) -> None:
         if episode not in ("life", "game"):
             raise UserError(f"task.episode={episode}: choose one of life, game.")
-        super().__init__(num_envs, seed=seed)
+        super().__init__(num_envs, seed=seed, use=use)
         self._games = [AtariGame(game, frame_cap) for _ in range(num_envs)]
         self._longest = -(-frame_cap // SKIP)
         self._lives_end = episode == "life"
@@ -228,16 +231,18 @@ class AtariEnv(BatchedEnv):
             "observation": torch.from_numpy(self._last_observation.copy()),
         }
 
-    def restore_simulator(self, state: dict[str, Any]) -> None:
+    def restore_simulator(self, state: dict[str, Any]) -> bool:
         """Replays the running games; the next :meth:`reset` hands out where they stand.
 
         Args:
             state: what :meth:`simulator_state` returned for an equal environment.
 
+        Returns:
+            Whether the replay came to the same moment. If not, ale-py, or the giril_rl that saved
+            the state, is another version, and all games begin anew.
+
         Raises:
             ValueError: if it is no state of such an environment; nothing is played then.
-            UserError: if the replay ends elsewhere, which means that ale-py, or the giril_rl that
-                saved the state, is another version.
         """
         seed = saved_seed(state)
         episode = saved_array(state, "episode", self._episode)
@@ -249,20 +254,29 @@ class AtariEnv(BatchedEnv):
         check_game_actions(actions, len(self._games), len(self.meanings), self._longest)
         self._root_seed, self._episode, self._between = seed, episode, between
         self._lives, self._last_observation = saved_lives, observation
+        self._restored = True
+        if self._replay(actions):
+            return True
+        self._between[:] = False
+        self._reset_where(np.ones_like(self._between))
+        return False
+
+    def _replay(self, actions: np.ndarray) -> bool:
+        """Whether the running games, played again, show what was saved."""
         frames, lives = np.zeros_like(self._last_observation[:, -1]), np.zeros_like(self._lives)
+        over = np.zeros_like(self._between)
         for i, begun in enumerate(self._episode.tolist()):
             self._episode[i] = (begun - 1) // RESEED_EVERY * RESEED_EVERY
             while self._episode[i] < begun:
                 frames[i], lives[i] = self._next_game(i)
         for column in actions.T:
+            if over[column >= 0].any():
+                return False
             playing = np.flatnonzero(column >= 0).tolist()
             for i, shown in zip(
                 playing, self._play(playing, column[playing].tolist()), strict=True
             ):
-                frames[i], lives[i] = shown.frame, shown.lives
-        if not (
-            np.array_equal(frames, self._last_observation[:, -1])
-            and np.array_equal(lives, self._lives)
-        ):
-            raise UserError(NOT_REPEATING)
-        self._restored = True
+                frames[i], lives[i], over[i] = shown.frame, shown.lives, shown.over or shown.cut
+        return np.array_equal(frames, self._last_observation[:, -1]) and np.array_equal(
+            lives, self._lives
+        )

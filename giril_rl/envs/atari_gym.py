@@ -35,7 +35,7 @@ class AtariGymEnv(gymnasium.Env):
     """
 
     def __init__(self, game: str, *, episode: Episode = "life", frame_cap: int = FRAME_CAP) -> None:
-        self._env = AtariEnv(game, 1, episode=episode, frame_cap=frame_cap)
+        self._env = _SeededAsRecorded(game, 1, episode=episode, frame_cap=frame_cap)
         shape = (STACK, SIDE, SIDE)
         self.observation_space = gymnasium.spaces.Box(0, 255, shape, np.uint8)
         self.action_space = gymnasium.spaces.Discrete(int(self._env.action_spec.space.n))
@@ -67,3 +67,11 @@ class AtariGymEnv(gymnasium.Env):
     def close(self) -> None:
         """Ends the emulator."""
         self._env.close(raise_if_closed=False)
+
+
+class _SeededAsRecorded(AtariEnv):
+    """A game whose emulator is seeded by the given seed alone, as in every recording so far."""
+
+    def _episode_seed(self, index: int) -> int:
+        entropy = [self._root_seed, index, int(self._episode[index])]
+        return int(np.random.SeedSequence(entropy).generate_state(1)[0])

@@ -11,13 +11,15 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Categorical, Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase
 
+from giril_rl.randomness import Use, stream_seed
+
 
 class BatchedEnv(EnvBase):
     """``num_envs`` simulators stepped as one TorchRL environment that can be brought back.
 
     ``("next", "observation")`` at an episode's end is the true terminal observation; the reset
     observation appears only as the next step's ``"observation"``. Every episode (of games, every
-    64th) has a seed of its own, drawn from ``seed``, the simulator's index and the episode's
+    64th) has a seed of its own, made of ``use``, ``seed``, the simulator's index and the episode's
     number, so that any moment of a run can be rebuilt by replaying actions
     (:meth:`simulator_state`, :meth:`restore_simulator`).
 
@@ -27,6 +29,7 @@ class BatchedEnv(EnvBase):
     Args:
         num_envs: number of simulators, the environment's batch size.
         seed: root of the episodes' seeds.
+        use: what the episodes are for; those of two uses never have equal seeds.
     """
 
     _onward_key = "observation"
@@ -35,12 +38,16 @@ class BatchedEnv(EnvBase):
     has_threads = False
     """Whether the simulators run in threads of their own."""
 
+    first_index = 0
+    """The first simulator's number, of which episodes have their seeds; more than 0 where a larger
+    environment is played in parts."""
+
     _last_observation: np.ndarray
 
-    def __init__(self, num_envs: int, *, seed: int = 0) -> None:
+    def __init__(self, num_envs: int, *, seed: int = 0, use: Use = "training") -> None:
         super().__init__(device=None, batch_size=[num_envs])
         self.is_closed = False  # EnvBase says True where no wrapper says otherwise.
-        self._root_seed = seed
+        self._root_seed, self._use = seed, use
         self._episode = np.zeros(num_envs, dtype=np.int64)
         self._restored = False
         self._false = torch.zeros(num_envs, 1, dtype=torch.bool)
@@ -101,8 +108,8 @@ class BatchedEnv(EnvBase):
         """Begins new episodes where ``mask`` says so; what all simulators then show."""
 
     def _episode_seed(self, index: int) -> int:
-        entropy = [self._root_seed, index, int(self._episode[index])]
-        return int(np.random.SeedSequence(entropy).generate_state(1)[0])
+        numbers = (self._root_seed, self.first_index + index, int(self._episode[index]))
+        return stream_seed(self._use, *numbers, bits=32)
 
     def _set_seed(self, seed: int | None) -> None:
         self._root_seed = 0 if seed is None else seed
@@ -113,19 +120,15 @@ class BatchedEnv(EnvBase):
         """What :meth:`restore_simulator` needs to bring another instance to this very moment."""
 
     @abstractmethod
-    def restore_simulator(self, state: dict[str, Any]) -> None:
+    def restore_simulator(self, state: dict[str, Any]) -> bool:
         """Replays the running episodes; the next :meth:`reset` hands out where they stand.
 
         Args:
             state: what :meth:`simulator_state` returned for an equal environment.
 
+        Returns:
+            Whether the replay came to the same moment; if not, all simulators begin new episodes.
+
         Raises:
             ValueError: if it is no state of such an environment; nothing is played then.
         """
-
-
-NOT_REPEATING = (
-    "the simulator does not repeat itself for equal seeds and actions, so that this run cannot be "
-    "continued: start it again in another folder (out=...)."
-)
-"""The refusal of a replay that ends elsewhere than it was saved."""

@@ -11,9 +11,12 @@ import torch
 from tensordict import TensorDictBase
 from torchrl.data import Categorical
 
+from giril_rl.envs.checking import env_name
 from giril_rl.envs.saved import saved_array
+from giril_rl.envs.spaces import shortest_limit
 from giril_rl.envs.vector import GymVectorEnv
 from giril_rl.errors import UserError
+from giril_rl.randomness import Use
 
 AfterFailure = Literal["reset", "continue"]
 
@@ -43,10 +46,13 @@ class FixedHorizonEnv(GymVectorEnv):
         num_envs: number of copies.
         after_failure: "reset" or "continue".
         seed: root of the episodes' seeds; each hidden reset begins an episode with its own.
-        max_episode_steps: the horizon; None takes the limit that the environment has.
+        use: what the episodes are for; those of two uses never have equal seeds.
+        max_episode_steps: the horizon; None takes the shortest limit that the environment has,
+            which counts as well where it is shorter.
 
     Raises:
-        UserError: as :class:`GymVectorEnv`, and where there is no time limit.
+        UserError: as :class:`GymVectorEnv`, and where there is no time limit; at a step, if an
+            environment truncates an episode by itself before the horizon.
 
     Examples:
         >>> make = lambda: gymnasium.make("CartPole-v1")
@@ -68,15 +74,20 @@ class FixedHorizonEnv(GymVectorEnv):
         *,
         after_failure: AfterFailure = "reset",
         seed: int = 0,
+        use: Use = "training",
         max_episode_steps: int | None = None,
     ) -> None:
-        super().__init__(make_fn, num_envs, seed=seed, max_episode_steps=max_episode_steps)
-        if self._limit is None:
+        super().__init__(make_fn, num_envs, seed=seed, use=use, max_episode_steps=max_episode_steps)
+        # A limit below another wrapper would begin anew at each hidden reset.
+        limits = (self._limit, shortest_limit(self._gym_envs[0]))
+        known = [limit for limit in limits if limit is not None]
+        if not known:
             raise UserError(
                 "an environment without a time limit has no fixed horizon: "
                 "set task.max_episode_steps."
             )
-        self._resets = after_failure == "reset"
+        self._limit = self._horizon = min(known)
+        self._failure_ends = after_failure == "reset"
         self._played = np.zeros(num_envs, dtype=np.int64)
         self._failed = np.zeros(num_envs, dtype=bool)
 
@@ -91,17 +102,27 @@ class FixedHorizonEnv(GymVectorEnv):
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         after = super()._step(tensordict)
         self._played += 1
+        self._check_horizon(after.get("truncated").view(-1).numpy())
         scored = torch.from_numpy(~self._failed).unsqueeze(-1)
         failed = after.get("terminated").view(-1).numpy()
         self._failed |= failed
         following = after.get("observation")
-        if self._resets and failed.any():
+        if self._failure_ends and failed.any():
             following = torch.from_numpy(self._restart(failed))
         after.set("following_observation", following)
         after.set("scored", scored)
         after.set("terminated", self._false.clone())
         after.set("done", after.get("truncated").clone())
         return after
+
+    def _check_horizon(self, cut: np.ndarray) -> None:
+        early = cut & (self._steps < self._horizon)
+        if early.any():
+            steps = int(self._played[early][0])
+            raise UserError(
+                f"{env_name(self._gym_envs[0])} truncates an episode by itself after {steps} "
+                f"steps, and the horizon is {self._horizon}: set task.max_episode_steps={steps}."
+            )
 
     def _root(self, observation: torch.Tensor) -> TensorDictBase:
         root = super()._root(observation)

@@ -21,6 +21,7 @@ from giril_rl.envs.stdout import silent_stdout
 from giril_rl.envs.vector import GymVectorEnv
 from giril_rl.errors import UserError
 from giril_rl.nearest import did_you_mean
+from giril_rl.randomness import Use
 
 BULLET = "BulletEnv"
 BULLET_PACKAGE = "pybullet_envs_gymnasium"
@@ -107,7 +108,7 @@ def _frames(task: TaskConfig) -> int:
     return FRAME_CAP if task.max_episode_steps is None else 4 * task.max_episode_steps
 
 
-def make_env(task: TaskConfig, num_envs: int, seed: int) -> BatchedEnv:
+def make_env(task: TaskConfig, num_envs: int, seed: int, *, use: Use = "training") -> BatchedEnv:
     """``num_envs`` environments of ``task`` as one TorchRL environment.
 
     Args:
@@ -115,6 +116,7 @@ def make_env(task: TaskConfig, num_envs: int, seed: int) -> BatchedEnv:
             Arcade Learning Environment an :class:`AtariEnv`.
         num_envs: batch size.
         seed: root of the episodes' seeds.
+        use: what the episodes are for; those of two uses never have equal seeds.
 
     Raises:
         UserError: as :func:`gym_factory`, and for spaces that are no vectors.
@@ -130,6 +132,7 @@ def make_env(task: TaskConfig, num_envs: int, seed: int) -> BatchedEnv:
             num_envs,
             episode=cast(Episode, task.episode),
             seed=seed,
+            use=use,
             frame_cap=_frames(task),
         )
     if task.horizon == "fixed":
@@ -138,8 +141,9 @@ def make_env(task: TaskConfig, num_envs: int, seed: int) -> BatchedEnv:
             num_envs,
             after_failure=cast(AfterFailure, task.after_failure),
             seed=seed,
+            use=use,
         )
-    return GymVectorEnv(gym_factory(task), num_envs, seed=seed)
+    return GymVectorEnv(gym_factory(task), num_envs, seed=seed, use=use)
 
 
 def for_scores(task: TaskConfig) -> TaskConfig:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from giril_rl.errors import UserError
+
 
 class RunningNormaliser(nn.Module):
     """Subtracts the running mean, divides by the running standard deviation, clips.
@@ -26,7 +28,13 @@ class RunningNormaliser(nn.Module):
         >>> normalise.update(torch.tensor([[0.0, 10.0], [2.0, 30.0]]))
         >>> normalise(torch.tensor([2.0, 10.0])).round(decimals=2)
         tensor([ 1., -1.])
+
+    Raises:
+        UserError: for observations of another size.
     """
+
+    event_dims = 1
+    """Dimensions of one observation."""
 
     mean: Tensor
     var: Tensor
@@ -45,7 +53,9 @@ class RunningNormaliser(nn.Module):
         self.register_buffer("factor", torch.ones(size))
 
     def forward(self, observation: Tensor) -> Tensor:
-        """Normalises ``(*batch, size)``."""
+        """Normalises ``(*batch, size)`` of any real dtype."""
+        check_size(observation, self.shift)
+        observation = observation.to(self.shift.dtype)
         return ((observation - self.shift) * self.factor).clamp_(-self.clip, self.clip)
 
     @torch.no_grad()
@@ -56,7 +66,12 @@ class RunningNormaliser(nn.Module):
             observation: raw observations.
             least: smallest deviation to divide by. A good player hardly moves some of its
                 observations; divided by so little, what it never saw would be far out of range.
+
+        Raises:
+            UserError: for another size, NaN or infinity; the statistics are then as they were.
         """
+        check_size(observation, self.mean)
+        _check_finite(observation)
         batch = observation.reshape(-1, observation.shape[-1]).double()
         self.mean.copy_(batch.mean(0))
         self.var.copy_(batch.var(0, correction=0).clamp(min=least**2))
@@ -66,7 +81,13 @@ class RunningNormaliser(nn.Module):
 
     @torch.no_grad()
     def update(self, observation: Tensor) -> None:
-        """Merges ``(*batch, size)`` into the statistics (Chan et al. 1983)."""
+        """Merges ``(*batch, size)`` into the statistics (Chan et al. 1983).
+
+        Raises:
+            UserError: for another size, NaN or infinity; the statistics are then as they were.
+        """
+        check_size(observation, self.mean)
+        _check_finite(observation)
         batch = observation.reshape(-1, observation.shape[-1]).double()
         n = batch.shape[0]
         total = self.count + n
@@ -77,3 +98,37 @@ class RunningNormaliser(nn.Module):
         self.count.copy_(total)
         self.shift.copy_(self.mean)
         self.factor.copy_((self.var + self.eps).rsqrt())
+
+
+def check_size(observation: Tensor, statistics: Tensor) -> None:
+    """Refuses observations that statistics of another size would broadcast.
+
+    Args:
+        observation: ``(*batch, size)``.
+        statistics: ``(size,)``.
+
+    Raises:
+        UserError: for another size.
+
+    Examples:
+        >>> import torch
+        >>> check_size(torch.zeros(7, 1), torch.zeros(3))
+        Traceback (most recent call last):
+        giril_rl.errors.UserError: observations have shape (7, 1) where (*batch, 3) is needed.
+    """
+    if observation.shape[-1:] != statistics.shape:
+        raise UserError(
+            f"observations have shape {tuple(observation.shape)} where (*batch, "
+            f"{statistics.shape[0]}) is needed."
+        )
+
+
+def _check_finite(observation: Tensor) -> None:
+    finite = observation.isfinite()
+    if not finite.all():
+        *where, entry = (~finite).nonzero()[0].tolist()
+        value = observation[(*where, entry)].item()
+        raise UserError(
+            f"an observation is not finite: {value} at entry {entry} of the one at {where} in the "
+            "batch, where running statistics would keep it for ever; mend the environment or data."
+        )

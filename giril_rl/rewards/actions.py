@@ -4,19 +4,10 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor, nn
-from torchrl.data import (
-    Binary,
-    Bounded,
-    Categorical,
-    Composite,
-    MultiCategorical,
-    MultiOneHot,
-    OneHot,
-    TensorSpec,
-    Unbounded,
-)
+from torchrl.data import Categorical, OneHot, TensorSpec
 
 from giril_rl.errors import UserError
+from giril_rl.networks.action_bounds import affine_map, single_action_spec
 
 
 class ActionEncoder(nn.Module):
@@ -32,9 +23,11 @@ class ActionEncoder(nn.Module):
             Composite of nothing else.
 
     Raises:
-        UserError: for a spec of another kind.
+        UserError: for a spec of another kind, or actions of another encoding than the spec's. Only
+            their dtype and shape are looked at, so that the encoder can be recorded as a graph.
 
     Examples:
+        >>> from torchrl.data import Bounded
         >>> ActionEncoder(Categorical(3))(torch.tensor([2, 0])).tolist()
         [[0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]
         >>> ActionEncoder(Bounded(0.0, 4.0, shape=(1,)))(torch.tensor([[3.0], [9.0]])).tolist()
@@ -48,38 +41,87 @@ class ActionEncoder(nn.Module):
 
     def __init__(self, spec: TensorSpec) -> None:
         super().__init__()
-        while isinstance(spec, Composite) and len(spec.keys()) == 1:
-            spec = next(iter(spec.values()))
+        spec = single_action_spec(spec)
         self.discrete = isinstance(spec, (Categorical, OneHot))
         self.one_hot = isinstance(spec, OneHot)
-        self.size = 0
-        if isinstance(spec, (MultiCategorical, MultiOneHot, Binary, Composite)):
-            raise _unsupported(spec)
-        if isinstance(spec, (Categorical, OneHot)):
-            self.size = int(spec.space.n)
+        self.size = int(spec.space.n if self.discrete else spec.shape[-1])
+        if self.discrete:
             return
-        continuous = isinstance(spec, (Bounded, Unbounded)) and spec.dtype.is_floating_point
-        if not continuous or not spec.shape:
-            raise _unsupported(spec)
-        self.size = spec.shape[-1]
-        low, high = (
-            bound.reshape(-1, self.size).to(device="cpu", dtype=torch.float64)
-            for bound in (spec.space.low, spec.space.high)
-        )
-        if (low != low[0]).any() or (high != high[0]).any():
-            raise UserError("the action bounds differ between environments: give them equal ones.")
-        # TorchRL writes "no bound" as the largest number of the dtype.
-        limit = torch.finfo(spec.dtype).max
-        low = torch.where(low[0] <= -limit, -torch.inf, low[0])
-        high = torch.where(high[0] >= limit, torch.inf, high[0])
-        bounded = low.isfinite() & high.isfinite() & (high > low)
-        offset = torch.where(bounded, (low + high) / 2, 0.0)
-        scale = torch.where(bounded, 2 / (high - low), 1.0)
-        for name, value in {"low": low, "high": high, "offset": offset, "scale": scale}.items():
+        low, high, offset, half_range = affine_map(spec)
+        buffers = {"low": low, "high": high, "offset": offset, "scale": 1 / half_range}
+        for name, value in buffers.items():
             self.register_buffer(name, value.to(torch.get_default_dtype()))
+
+    @property
+    def kind(self) -> str:
+        """What the actions are, in a word or two."""
+        if self.one_hot:
+            return "one-hot vectors"
+        return "integers" if self.discrete else "vectors"
+
+    @property
+    def event(self) -> tuple[int, ...]:
+        """The shape of one action."""
+        return () if self.discrete and not self.one_hot else (self.size,)
+
+    def batch(self, action: Tensor) -> torch.Size:
+        """The leading shape of actions, whose dtype and width are checked.
+
+        Raises:
+            UserError: for another dtype or width.
+
+        Examples:
+            >>> from torchrl.data import OneHot
+            >>> ActionEncoder(OneHot(3)).batch(torch.tensor([2, 0]))
+            Traceback (most recent call last):
+            giril_rl.errors.UserError: actions are torch.int64 of shape (2,): the reward reads
+            one-hot vectors of shape (*batch, 3). Give those, or build it with these actions' own
+            spec.
+        """
+        if self.event:
+            fits = action.shape[-1:] == self.event
+        else:
+            fits = not action.is_floating_point()
+        if not fits:
+            shape = f"(*batch, {self.size})" if self.event else "(*batch,)"
+            raise UserError(
+                f"actions are {action.dtype} of shape {tuple(action.shape)}: the reward reads "
+                f"{self.kind} of shape {shape}. Give those, or build it with these actions' own "
+                "spec."
+            )
+        return action.shape[: action.ndim - len(self.event)]
+
+    def check_values(self, action: Tensor) -> None:
+        """Refuses what has the right shape and is no action. It looks at values, so call it once.
+
+        Raises:
+            UserError: for integers outside the spec, or vectors that are not one-hot.
+
+        Examples:
+            >>> ActionEncoder(Categorical(3)).check_values(torch.tensor([0, 3]))
+            Traceback (most recent call last):
+            giril_rl.errors.UserError: the demonstration's action at index [1] is 3: the reward's
+            action spec has integers from 0 to 2.
+        """
+        if not self.discrete:
+            return
+        if self.one_hot:
+            wrong = (action != 0).sum(-1) != 1
+            wrong |= (action == 1).sum(-1) != 1
+            needed = f"one-hot vectors of {self.size} numbers"
+        else:
+            wrong = (action < 0) | (action >= self.size)
+            needed = f"integers from 0 to {self.size - 1}"
+        if wrong.any():
+            index = wrong.nonzero()[0].tolist()
+            raise UserError(
+                f"the demonstration's action at index {index} is {action[tuple(index)].tolist()}: "
+                f"the reward's action spec has {needed}."
+            )
 
     def forward(self, action: Tensor) -> Tensor:
         """The action codes ``(*batch, size)``."""
+        self.batch(action)
         if self.one_hot:
             return action.to(torch.get_default_dtype())
         if self.discrete:
@@ -91,17 +133,12 @@ class ActionEncoder(nn.Module):
 
     def target(self, action: Tensor) -> Tensor:
         """What the encoder's latent is fitted to: class indices if discrete, else the code."""
-        if self.one_hot:
-            return action.to(torch.uint8).argmax(-1)
-        return action.long() if self.discrete else self(action)
+        if self.discrete and not self.one_hot:
+            self.batch(action)
+            return action.long()
+        code = self(action)
+        return code.argmax(-1) if self.one_hot else code
 
     def extra_repr(self) -> str:
         """Shows kind and size when printed."""
         return f"{'discrete' if self.discrete else 'box'}, size={self.size}"
-
-
-def _unsupported(spec: TensorSpec) -> UserError:
-    return UserError(
-        f"an action spec of the kind {type(spec).__name__} with shape {tuple(spec.shape)} is not "
-        "supported: give a single Categorical, OneHot or one-dimensional Bounded or Unbounded one."
-    )

@@ -104,8 +104,8 @@ def gradient_penalty(score: Callable[..., Tensor], points: Sequence[Tensor]) -> 
     The norm is taken over the gradients with respect to all points of a pair together.
 
     Args:
-        score: called with ``points``; one number per pair.
-        points: tensors ``(n, *features)``, such as observations and action codes.
+        score: called with ``points``; one number per pair, whose shape is that of the batch.
+        points: tensors ``(*batch, *features)``, such as observations and action codes.
 
     Returns:
         A scalar, differentiable with respect to the parameters of ``score``.
@@ -116,8 +116,10 @@ def gradient_penalty(score: Callable[..., Tensor], points: Sequence[Tensor]) -> 
     """
     with torch.enable_grad():
         leaves = [point.detach().requires_grad_() for point in points]
-        gradients = torch.autograd.grad(score(*leaves).sum(), leaves, create_graph=True)
-        norm = torch.linalg.vector_norm(torch.cat([g.flatten(1) for g in gradients], 1), dim=1)
+        scores = score(*leaves)
+        gradients = torch.autograd.grad(scores.sum(), leaves, create_graph=True)
+        slopes = torch.cat([g.reshape(*scores.shape, -1) for g in gradients], -1)
+        norm = torch.linalg.vector_norm(slopes, dim=-1)
         return (norm - 1).square().mean()
 
 

@@ -23,6 +23,7 @@ from giril_rl.rewards.discriminator import (
 )
 from giril_rl.rewards.keys import PAIR_KEYS, REWARD_KEYS
 from giril_rl.rewards.pixel_scaler import PixelScaler
+from giril_rl.rewards.transitions import check_output
 
 
 class BottleneckReward(DiscriminatorReward):
@@ -146,7 +147,9 @@ class BottleneckReward(DiscriminatorReward):
 
     def judge(self, z: Tensor) -> Tensor:
         """The logit ``(*batch,)`` of a code ``(*batch, latent)``."""
-        return self.head(z).squeeze(-1)
+        logit = self.head(z)
+        check_output("the bottleneck's head", logit, (*z.shape[:-1], 1))
+        return logit.squeeze(-1)
 
     def logit(self, observation: Tensor, action_code: Tensor) -> Tensor:
         """The logit ``(*batch,)`` of the code's mean."""

@@ -35,7 +35,7 @@ class BottleneckLoss(DiscriminatorLoss):
         >>> from tensordict import TensorDict
         >>> from torchrl.data import Categorical
         >>> reward = BottleneckReward.for_vectors(2, Categorical(3), normalise="raw")
-        >>> pairs = lambda n: {"observation": torch.zeros(n, 2), "action": torch.zeros(n)}
+        >>> pairs = lambda n: {"observation": torch.zeros(n, 2), "action": torch.zeros(n).long()}
         >>> loss = BottleneckLoss(reward, information=0.5, beta_step=0.1)
         >>> out = loss(TensorDict({"expert": pairs(50), "policy": pairs(256)}))
         >>> loss.update_beta(torch.tensor(2.5))

@@ -14,6 +14,7 @@ from giril_rl.rewards.equations import reconstruction_error
 from giril_rl.rewards.keys import REWARD_KEYS, check_keys
 from giril_rl.rewards.pixel_scaler import PixelScaler
 from giril_rl.rewards.scaler import ObservationScaler
+from giril_rl.rewards.transitions import check_states, read
 
 
 class CopyReward(TensorDictModuleBase):
@@ -32,7 +33,7 @@ class CopyReward(TensorDictModuleBase):
         out_keys: where the reward is written, one key.
 
     Raises:
-        UserError: for another number of keys.
+        UserError: for another number of keys, or entries that are missing or of a wrong shape.
 
     Examples:
         >>> import torch
@@ -62,8 +63,9 @@ class CopyReward(TensorDictModuleBase):
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes each transition's reward."""
-        pair = tuple(tensordict.get(key) for key in self.in_keys)
-        error = per_transition(self._error, pair, self.scaler.event_dims)
+        observation, following = read(tensordict, self.in_keys)
+        check_states(observation, following)
+        error = per_transition(self._error, (observation, following), self.scaler.event_dims)
         return tensordict.set(self.out_keys[0], self.scale * error.unsqueeze(-1))
 
     def _error(self, observation: Tensor, following: Tensor) -> Tensor:

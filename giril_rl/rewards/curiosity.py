@@ -20,6 +20,7 @@ from giril_rl.rewards.chunks import per_transition
 from giril_rl.rewards.keys import REWARD_KEYS, TRANSITION_KEYS, check_keys
 from giril_rl.rewards.pixel_scaler import PixelScaler
 from giril_rl.rewards.scaler import ObservationScaler, ScalingRule
+from giril_rl.rewards.transitions import check_output, check_transitions, read
 
 
 def feature_error(predicted: Tensor, features: Tensor) -> Tensor:
@@ -61,7 +62,7 @@ class CuriosityReward(Pretrained, TensorDictModuleBase):
         out_keys: where the reward is written, one key.
 
     Raises:
-        UserError: for another number of keys.
+        UserError: for another number of keys, or entries that are missing or of a wrong shape.
 
     Examples:
         >>> import torch
@@ -170,7 +171,7 @@ class CuriosityReward(Pretrained, TensorDictModuleBase):
         mode; :class:`~giril_rl.transforms.IntrinsicReward` calls it in eval mode.
 
         Args:
-            action_spec: the environment's action spec, discrete.
+            action_spec: the environment's action spec.
             channels: frames in an observation.
             scale: see :meth:`for_vectors`, as for all others.
             seed: seed of the weights.
@@ -203,15 +204,21 @@ class CuriosityReward(Pretrained, TensorDictModuleBase):
         """``phi_hat(s')`` from ``phi(s)`` and the action's code."""
         return self.forward_model(features, action_code)
 
+    def forward_error(self, features: Tensor, action_code: Tensor, next_features: Tensor) -> Tensor:
+        """:func:`feature_error` of :meth:`predict`, whose shape is checked."""
+        predicted = self.predict(features, action_code)
+        check_output("the forward model", predicted, next_features.shape)
+        return feature_error(predicted, next_features)
+
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes each transition's reward."""
-        observation, action, following = (tensordict.get(key) for key in self.in_keys)
-        transitions = (observation, action, following)
+        transitions = read(tensordict, self.in_keys)
+        check_transitions(self.scaler, self.actions, *transitions)
         error = per_transition(self._error, transitions, self.scaler.event_dims)
         return tensordict.set(self.out_keys[0], self.scale * error.unsqueeze(-1))
 
     def _error(self, observation: Tensor, action: Tensor, following: Tensor) -> Tensor:
         features = self.features(self.scaler(observation))
         next_features = self.features(self.scaler(following))
-        return feature_error(self.predict(features, self.actions(action)), next_features)
+        return self.forward_error(features, self.actions(action), next_features)

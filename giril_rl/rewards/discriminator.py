@@ -25,6 +25,7 @@ from giril_rl.rewards.chunks import per_transition
 from giril_rl.rewards.keys import PAIR_KEYS, REWARD_KEYS, check_keys
 from giril_rl.rewards.pixel_scaler import PixelScaler
 from giril_rl.rewards.scaler import ObservationScaler
+from giril_rl.rewards.transitions import check_actions, check_output, read
 
 DiscriminatorScaling = Literal["running", "demo_range", "standardise", "raw"]
 
@@ -39,20 +40,23 @@ class DiscriminatorReward(Pretrained, TensorDictModuleBase):
     Args:
         network: called with s and the action's code, gives one number, the logit of "this is the
             expert's".
-        scaler: applied to the observation.
+        scaler: applied to the observation. Where it says how many ``event_dims`` an observation
+            has, as this package's do, the actions' shape is held to the observations'.
         actions: turns actions into codes.
         form: the reward's form.
         in_keys: keys of observation and action.
         out_keys: where the reward is written, one key.
 
     Raises:
-        UserError: for an unknown form or a wrong number of keys.
+        UserError: for an unknown form or a wrong number of keys, or entries that are missing or of
+            a wrong shape.
 
     Examples:
         >>> from tensordict import TensorDict
         >>> from torchrl.data import Categorical
         >>> reward = DiscriminatorReward.for_vectors(2, Categorical(3), normalise="raw")
-        >>> batch = TensorDict({"observation": torch.zeros(4, 2), "action": torch.zeros(4)}, [4])
+        >>> s, a = torch.zeros(4, 2), torch.zeros(4, dtype=torch.int64)
+        >>> batch = TensorDict({"observation": s, "action": a}, [4])
         >>> reward(batch)["next", "intrinsic_reward"].shape
         torch.Size([4, 1])
     """
@@ -135,7 +139,7 @@ class DiscriminatorReward(Pretrained, TensorDictModuleBase):
         """The paper's body for stacks of 84x84 frames, initialised from ``seed`` alone.
 
         Args:
-            action_spec: the environment's action spec, discrete.
+            action_spec: the environment's action spec.
             channels: frames in an observation.
             form: see :meth:`for_vectors`, as for all others.
             seed: seed of the weights.
@@ -169,18 +173,21 @@ class DiscriminatorReward(Pretrained, TensorDictModuleBase):
 
     def inputs(self, observation: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
         """The scaled observation and the action's code, for what the environment gives."""
+        if (event_dims := getattr(self.scaler, "event_dims", None)) is not None:
+            check_actions(self.actions, action, observation, event_dims)
         return self.scaler(observation), self.actions(action)
 
     def logit(self, observation: Tensor, action_code: Tensor) -> Tensor:
         """The logit ``(*batch,)`` of a scaled observation and an action's code."""
-        return self.network(observation, action_code).squeeze(-1)
+        logit = self.network(observation, action_code)
+        check_output("the discriminator", logit, (*action_code.shape[:-1], 1))
+        return logit.squeeze(-1)
 
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes each transition's reward."""
-        pair = tuple(tensordict.get(key) for key in self.in_keys)
-        dims = 3 if isinstance(self.scaler, PixelScaler) else 1
-        reward = per_transition(self._value, pair, dims)
+        pair = read(tensordict, self.in_keys)
+        reward = per_transition(self._value, pair, getattr(self.scaler, "event_dims", 1))
         return tensordict.set(self.out_keys[0], reward.unsqueeze(-1))
 
     def _value(self, observation: Tensor, action: Tensor) -> Tensor:

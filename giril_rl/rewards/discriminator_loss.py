@@ -16,6 +16,7 @@ from giril_rl.networks.batch_norm import running_statistics
 from giril_rl.rewards.adversarial import discriminator_loss, gradient_penalty, interpolated
 from giril_rl.rewards.discriminator import DiscriminatorReward
 from giril_rl.rewards.functional import hold_reward, reward_parameters
+from giril_rl.rewards.transitions import read
 
 
 class DiscriminatorLoss(LossModule):
@@ -30,8 +31,8 @@ class DiscriminatorLoss(LossModule):
 
     Their sum is to be minimised. ``accuracy_expert`` and ``accuracy_policy`` are logged besides.
 
-    The two sets lie beside each other, usually under ``"expert"`` and ``"policy"``; each is flat,
-    ``(n, ...)``. Their sizes may differ; the TensorDict that holds both then has no batch
+    The two sets lie beside each other, usually under ``"expert"`` and ``"policy"``, each of any
+    leading shape. Their shapes may differ; the TensorDict that holds both then has no batch
     dimension. Without penalty and for equal sizes the loss is that of TorchRL's ``GAILLoss``, which
     wants probabilities. There is no ``reduction``: each term is a mean over a set of its own.
 
@@ -41,12 +42,12 @@ class DiscriminatorLoss(LossModule):
         functional: see :class:`~giril_rl.rewards.TransitionLoss`.
 
     Raises:
-        UserError: for a negative penalty.
+        UserError: for a negative penalty, or a set that is missing, empty or of a wrong shape.
 
     Examples:
         >>> from torchrl.data import Categorical
         >>> reward = DiscriminatorReward.for_vectors(2, Categorical(3), normalise="raw")
-        >>> pairs = lambda n: {"observation": torch.zeros(n, 2), "action": torch.zeros(n)}
+        >>> pairs = lambda n: {"observation": torch.zeros(n, 2), "action": torch.zeros(n).long()}
         >>> batch = TensorDict({"expert": pairs(50), "policy": pairs(256)})
         >>> sorted(DiscriminatorLoss(reward, penalty=10.0)(batch).keys())
         ['accuracy_expert', 'accuracy_policy', 'loss_expert', 'loss_penalty', 'loss_policy']
@@ -57,9 +58,9 @@ class DiscriminatorLoss(LossModule):
         """The keys that :meth:`set_keys` changes; their defaults follow the reward's ``in_keys``.
 
         Attributes:
-            expert_observation: raw observations of the expert ``(n, d)``.
+            expert_observation: raw observations of the expert ``(*n, d)``.
             expert_action: its actions, as the environment takes them.
-            policy_observation: raw observations of the policy ``(m, d)``.
+            policy_observation: raw observations of the policy ``(*m, d)``.
             policy_action: its actions.
         """
 
@@ -121,9 +122,9 @@ class DiscriminatorLoss(LossModule):
             return self._terms(tensordict)
 
     def _terms(self, tensordict: TensorDictBase) -> TensorDictBase:
-        entries = [tensordict.get(key) for key in self.in_keys]
-        expert = self.reward.inputs(*entries[:2])
-        policy = self.reward.inputs(*entries[2:])
+        entries = read(tensordict, self.in_keys)
+        expert = _flat("expert", *self.reward.inputs(*entries[:2]))
+        policy = _flat("policy", *self.reward.inputs(*entries[2:]))
         # One pass for both sets.
         observation, code = (torch.cat(sets) for sets in zip(expert, policy, strict=True))
         logit, out = self._judge(observation, code, len(expert[0]))
@@ -144,3 +145,14 @@ class DiscriminatorLoss(LossModule):
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """The logits of both sets, of which the first ``experts`` are the expert's."""
         return self.reward.logit(observation, code), {}
+
+
+def _flat(name: str, observation: Tensor, code: Tensor) -> tuple[Tensor, Tensor]:
+    """A set's scaled observations and action codes, ``(n, ...)``."""
+    dims = code.ndim - 1
+    if dims != 1:
+        observation = observation.reshape(-1, *observation.shape[dims:])
+        code = code.reshape(-1, code.shape[-1])
+    if not len(code):
+        raise UserError(f"the {name}'s set has no pairs: give at least one.")
+    return observation, code

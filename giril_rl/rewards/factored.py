@@ -6,6 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from giril_rl.errors import UserError
 from giril_rl.networks.rows import ROWS, rows_kernel
 
 HALF_RANGE = 127.5
@@ -43,6 +44,9 @@ def factored_error(
     Returns:
         The error ``(*batch,)``.
 
+    Raises:
+        UserError: for observations of another shape.
+
     Examples:
         >>> table, weight = torch.zeros(2, 4, 84, 84), torch.zeros(4, 4, 3, 3)
         >>> white = torch.full((3, 4, 84, 84), 255, dtype=torch.uint8)
@@ -50,6 +54,12 @@ def factored_error(
         [28224.0, 28224.0, 28224.0]
     """
     batch, frame = action.shape, table.shape[1:]
+    for frames in (observation, following):
+        if frames.shape != (*batch, *frame):
+            raise UserError(
+                f"frames have shape {tuple(frames.shape)} where {(*batch, *frame)} is needed: "
+                "channels come before height and width."
+            )
     action = action.reshape(-1).long()
     observation, following = (x.reshape(-1, *frame) for x in (observation, following))
     table = _deal(_raw_table(table, state_weight)).flatten(1, 2)

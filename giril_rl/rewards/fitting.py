@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from tensordict import TensorDictBase
 
 from giril_rl.errors import UserError
 from giril_rl.randomness import seeded
 from giril_rl.rewards.transition_loss import TransitionLoss
+from giril_rl.rewards.transitions import check_finite, check_transitions, read
 
 
 def fit(
@@ -36,8 +39,9 @@ def fit(
         The loss's terms at the last step.
 
     Raises:
-        UserError: for a loss that needs the policy's transitions as well, or no transitions or
-            steps.
+        UserError: for a loss that needs the policy's transitions as well, no transitions or steps,
+            entries that are missing, NaN, infinite or of a wrong shape, actions outside the action
+            spec, or a loss that is no longer finite at the end.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -59,6 +63,7 @@ def fit(
         raise UserError(
             f"{count} transitions, steps={steps} and batch={batch}: give at least one of each."
         )
+    _check(loss, demonstration)
     device = next(loss.parameters()).device
     data = demonstration.select(*loss.in_keys).reshape(-1).to(device)
     loss.reward.scaler.fit(data.get(loss.in_keys[0]))
@@ -71,4 +76,24 @@ def fit(
             torch.stack([term.sum() for term in terms.values()]).sum().backward()
             optimizer.step()
     loss.eval()
-    return {str(key): term.mean().item() for key, term in terms.items()}
+    last = {str(key): term.mean().item() for key, term in terms.items()}
+    for name, value in last.items():
+        if not math.isfinite(value):
+            raise UserError(f"{name} is {value} after {steps} steps of lr={lr}: give a smaller lr.")
+    return last
+
+
+def _check(loss: TransitionLoss, demonstration: TensorDictBase) -> None:
+    """Looks at the whole demonstration once, so that a minibatch need not be looked at."""
+    entries = observation, action, following = read(demonstration, loss.in_keys)
+    scaler, actions = loss.reward.scaler, loss.reward.actions
+    batch = observation.shape[: observation.ndim - scaler.event_dims]
+    if batch != demonstration.batch_size:
+        raise UserError(
+            f"the demonstration's batch_size is {list(demonstration.batch_size)} where its "
+            f"observations have {list(batch)}: give TensorDict(..., batch_size={list(batch)})."
+        )
+    check_transitions(scaler, actions, observation, action, following)
+    for key, entry in zip(loss.in_keys, entries, strict=True):
+        check_finite(str(key), entry)
+    actions.check_values(action)

@@ -27,6 +27,7 @@ from giril_rl.rewards.factored import factored_error
 from giril_rl.rewards.keys import REWARD_KEYS, TRANSITION_KEYS, check_keys
 from giril_rl.rewards.pixel_scaler import PixelScaler
 from giril_rl.rewards.scaler import ObservationScaler, ScalingRule
+from giril_rl.rewards.transitions import check_output, check_transitions, read
 
 Prior = Literal["standard", "conditional"]
 
@@ -42,9 +43,11 @@ class GenerativeReward(Pretrained, TensorDictModuleBase):
 
     Reads observation ``(*batch, d)`` or, of uint8, ``(*batch, channels, 84, 84)``, action and next
     observation, writes one reward per transition, ``(*batch, 1)``, without averaging. For frames at
-    ``beta=1`` the decoder runs once for each action rather than once for each transition, see
-    :func:`~giril_rl.rewards.factored_error`; the numbers are the same to 1e-5. Train it with
-    :class:`~giril_rl.rewards.GenerativeRewardLoss`, after ``reward.scaler.fit(observations)``.
+    ``beta=1`` the decoder runs once for each discrete action rather than once for each transition,
+    see :func:`~giril_rl.rewards.factored_error`; the numbers are the same to 1e-5. It runs for each
+    transition if decoder, scaler or action encoder is a subclass with a ``forward`` of its own.
+    Train it with :class:`~giril_rl.rewards.GenerativeRewardLoss`, after
+    ``reward.scaler.fit(observations)``.
 
     Args:
         encoder: called with s and s', gives ``2 * latent`` numbers, mean and log-variance of z.
@@ -59,7 +62,7 @@ class GenerativeReward(Pretrained, TensorDictModuleBase):
         out_keys: where the reward is written, one key.
 
     Raises:
-        UserError: for a beta outside (0, 1].
+        UserError: for a beta outside (0, 1], or entries that are missing or of a wrong shape.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -178,7 +181,7 @@ class GenerativeReward(Pretrained, TensorDictModuleBase):
         """The paper's bodies for stacks of 84x84 frames (Table 2), initialised from ``seed`` alone.
 
         Args:
-            action_spec: the environment's action spec, discrete; z has its size.
+            action_spec: the environment's action spec; z has its size.
             channels: frames in an observation.
             beta: see :meth:`for_vectors`, as for all others.
             scale: lambda.
@@ -218,7 +221,9 @@ class GenerativeReward(Pretrained, TensorDictModuleBase):
 
     def decode(self, action_code: Tensor, observation: Tensor) -> Tensor:
         """The predicted next observation, scaled but not clamped, for a scaled observation."""
-        return self.decoder(action_code, observation)
+        predicted = self.decoder(action_code, observation)
+        check_output("the decoder", predicted, observation.shape)
+        return predicted
 
     def predict(self, observation: Tensor, action: Tensor, following: Tensor) -> Tensor:
         """What the reward compares with s': the predicted next observation, scaled and clamped.
@@ -238,6 +243,7 @@ class GenerativeReward(Pretrained, TensorDictModuleBase):
             >>> reward.predict(black, torch.tensor([0, 2]), black).shape
             torch.Size([2, 4, 84, 84])
         """
+        check_transitions(self.scaler, self.actions, observation, action, following)
         return self._predict(self.scaler(observation), action, self.scaler(following))
 
     def prior(self, observation: Tensor) -> tuple[Tensor | None, Tensor | None]:
@@ -250,12 +256,12 @@ class GenerativeReward(Pretrained, TensorDictModuleBase):
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes each transition's reward."""
-        observation, action, following = (tensordict.get(key) for key in self.in_keys)
-        transitions = (observation, action, following)
-        if not self._is_factored(observation):
+        transitions = observation, action, following = read(tensordict, self.in_keys)
+        check_transitions(self.scaler, self.actions, observation, action, following)
+        if not self._is_factored(observation, following):
             error = per_transition(self._error, transitions, self.scaler.event_dims)
-        elif self.beta < 1:
-            error = per_transition(self._blended_error, transitions, self.scaler.event_dims)
+        elif self.beta < 1 or not self._is_one_hot():
+            error = per_transition(self._coded_error, transitions, self.scaler.event_dims)
         else:
             table, weight = self._table(cast(PixelDecoder, self.decoder))
             index = self.actions.target(action)
@@ -268,7 +274,7 @@ class GenerativeReward(Pretrained, TensorDictModuleBase):
         predicted = self._predict(observation, action, following)
         return reconstruction_error(predicted, following, self.scaler.event_dims)
 
-    def _blended_error(self, observation: Tensor, action: Tensor, following: Tensor) -> Tensor:
+    def _coded_error(self, observation: Tensor, action: Tensor, following: Tensor) -> Tensor:
         """The same where each transition has a code of its own, by the decoder's two parts."""
         decoder, batch = cast(PixelDecoder, self.decoder), observation.shape[:-3]
         code = self._code(self.scaler(observation), action, self.scaler(following))
@@ -291,13 +297,18 @@ class GenerativeReward(Pretrained, TensorDictModuleBase):
             code = blend_action(code, self._encoded_action(observation, following), self.beta)
         return code
 
-    def _is_factored(self, observation: Tensor) -> bool:
+    def _is_factored(self, observation: Tensor, following: Tensor) -> bool:
         """Whether the decoder's two parts can be computed apart: exact, but without gradient."""
         return (
-            isinstance(self.decoder, PixelDecoder)
-            and observation.dtype == torch.uint8
+            _computes_as(self.decoder, PixelDecoder)
+            and _computes_as(self.scaler, PixelScaler)
+            and observation.dtype == following.dtype == torch.uint8
             and not torch.is_grad_enabled()
         )
+
+    def _is_one_hot(self) -> bool:
+        """Whether there are only as many codes as actions."""
+        return self.actions.discrete and _computes_as(self.actions, ActionEncoder)
 
     def _encoded_action(self, observation: Tensor, following: Tensor) -> Tensor:
         mu, logvar = self.encode(observation, following)
@@ -313,3 +324,8 @@ class GenerativeReward(Pretrained, TensorDictModuleBase):
     def set_extra_state(self, state: Tensor) -> None:
         """Restores the noise generator."""
         self._generator.set_state(state.cpu())
+
+
+def _computes_as(module: nn.Module, kind: type[nn.Module]) -> bool:
+    """Whether a module computes what ``kind`` does; a subclass may compute something else."""
+    return getattr(module.forward, "__func__", None) is kind.forward

@@ -11,6 +11,7 @@ from giril_rl.errors import UserError
 from giril_rl.rewards.equations import reconstruction_error
 from giril_rl.rewards.generative import GenerativeReward
 from giril_rl.rewards.transition_loss import Reduction, TransitionLoss
+from giril_rl.rewards.transitions import check_transitions
 
 
 def gaussian_kl(
@@ -123,6 +124,7 @@ class GenerativeRewardLoss(TransitionLoss):
     ) -> tuple[Tensor, Tensor, Tensor]:
         """The three terms, for one sample of z."""
         reward = self.reward
+        check_transitions(reward.scaler, reward.actions, observation, action, following)
         observation, following = reward.scaler(observation), reward.scaler(following)
         mu, logvar = reward.encode(observation, following)
         z = mu + (0.5 * logvar).exp() * torch.randn_like(mu)

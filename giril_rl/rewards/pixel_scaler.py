@@ -35,17 +35,22 @@ class PixelScaler(nn.Module):
         Raises:
             UserError: for anything but uint8 of at least three dimensions.
         """
-        if observations.dtype != torch.uint8 or observations.ndim < 3:
-            raise UserError(
-                f"pixels are uint8 of shape (N, channels, height, width), not {observations.dtype} "
-                f"of shape {tuple(observations.shape)}."
-            )
+        _check_frames(observations)
         return self
 
     def forward(self, observation: Tensor) -> Tensor:
-        """Scales frames ``(*batch, channels, height, width)``."""
+        """Scales frames ``(*batch, channels, height, width)``; others are refused as by `fit`."""
+        _check_frames(observation)
         return observation.to(torch.get_default_dtype()) / 127.5 - 1
 
     def extra_repr(self) -> str:
         """Shows clamp when printed."""
         return f"clamp={self.clamp}"
+
+
+def _check_frames(observations: Tensor) -> None:
+    if observations.dtype != torch.uint8 or observations.ndim < 3:
+        raise UserError(
+            f"pixels are uint8 of shape (*batch, channels, height, width), not "
+            f"{observations.dtype} of shape {tuple(observations.shape)}."
+        )

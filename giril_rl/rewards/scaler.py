@@ -8,6 +8,8 @@ import torch
 from torch import Tensor, nn
 
 from giril_rl.errors import UserError
+from giril_rl.networks.normalise import check_size
+from giril_rl.rewards.transitions import check_finite
 
 ScalingRule = Literal["demo_range", "standardise", "raw"]
 
@@ -22,14 +24,15 @@ class ObservationScaler(nn.Module):
         observation_dim: size of the observation's last dimension.
         rule: ``"demo_range"`` maps the demonstration's minimum and maximum of each dimension to -1
             and 1, ``"standardise"`` its mean to 0 and its (population) standard deviation to 1,
-            ``"raw"`` leaves observations as they are and needs no :meth:`fit`. A dimension that is
+            ``"raw"`` neither shifts nor divides and needs no :meth:`fit`. A dimension that is
             constant in the demonstration is only shifted to 0.
-        clamp: clamp the result to [-limit, limit].
+        clamp: clamp the result to [-limit, limit], raw observations too: ``rule="raw"`` leaves them
+            as they are with ``clamp=False``.
         limit: the bound.
 
     Raises:
-        UserError: for an unknown rule, for a demonstration that cannot be fitted, or when used
-            before :meth:`fit`.
+        UserError: for an unknown rule, for a demonstration that cannot be fitted, for observations
+            of another size, or when used before :meth:`fit`.
 
     Examples:
         >>> scaler = ObservationScaler(2, rule="demo_range")
@@ -77,8 +80,7 @@ class ObservationScaler(nn.Module):
                 f"{tuple(observations.shape)}."
             )
         data = observations.reshape(-1, dim).to(device=self.offset.device, dtype=torch.float64)
-        if not data.isfinite().all():
-            raise UserError("the demonstration's observations contain NaN or infinity: check it.")
+        check_finite("observation", observations)
         if self.rule == "raw":
             return self
         low, high = data.amin(0), data.amax(0)
@@ -96,7 +98,8 @@ class ObservationScaler(nn.Module):
         return self
 
     def forward(self, observation: Tensor) -> Tensor:
-        """Scales observations of any leading batch shape ``(*batch, observation_dim)``."""
+        """Scales observations ``(*batch, observation_dim)`` of any real dtype."""
+        check_size(observation, self.offset)
         if not self._known_fitted:
             if not bool(self.fitted):
                 raise UserError(

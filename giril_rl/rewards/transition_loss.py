@@ -15,6 +15,7 @@ from torchrl.objectives import LossModule
 
 from giril_rl.errors import UserError
 from giril_rl.rewards.functional import hold_reward, reward_parameters
+from giril_rl.rewards.transitions import read
 
 Reduction = Literal["mean", "sum", "none"]
 
@@ -34,7 +35,7 @@ class TransitionLoss(LossModule):
             loss's ``state_dict`` are the module's, its noise generator's included.
 
     Raises:
-        UserError: for an unknown reduction.
+        UserError: for an unknown reduction, or entries that are missing.
 
     Examples:
         >>> from torchrl.data import Bounded
@@ -117,7 +118,7 @@ class TransitionLoss(LossModule):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """The terms, reduced; with ``reduction="none"`` of the batch's shape."""
         with reward_parameters(self):
-            terms = self.terms(*(tensordict.get(key) for key in self.in_keys))
+            terms = self.terms(*read(tensordict, self.in_keys))
         reduced = {
             name: self._reduce_loss(term, tensordict=tensordict)
             for name, term in zip(self.out_keys, terms, strict=True)

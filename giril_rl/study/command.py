@@ -67,7 +67,7 @@ def run_study(name: str, texts: Sequence[str], *, dry_run: bool = False) -> int:
             print(_line(study, run))
         print(f"{len(study.runs)} runs, {finished} of them finished.")
         return 0
-    launcher = _launcher(settings)
+    launcher = _launcher(settings, any(run.config.device == "cuda" for run in study.runs))
     at_once = settings.jobs or launcher.slots
     print(
         f"study {spec.name}: {len(study.runs)} runs, {finished} finished before, {at_once} at a "
@@ -83,14 +83,14 @@ def _line(study: StudyFolder, run: StudyRun) -> str:
     return f"{study.standings[run.name].state:<9} {run.label}: giril {' '.join(run.command)}"
 
 
-def _launcher(settings: StudyConfig) -> Launcher:
+def _launcher(settings: StudyConfig, on_gpu: bool) -> Launcher:
     if settings.launcher == "ray":
         from giril_rl.study.on_ray import RayLauncher
 
-        return RayLauncher(settings.ray_address)
-    from giril_rl.study.local import LocalLauncher
+        return RayLauncher(settings.ray_address, per_gpu=settings.per_gpu if on_gpu else None)
+    from giril_rl.study.local import LocalLauncher, visible_gpus
 
-    return LocalLauncher()
+    return LocalLauncher(visible_gpus() if on_gpu else [], per_gpu=settings.per_gpu)
 
 
 def _outcome(study: StudyFolder) -> int:

@@ -6,7 +6,6 @@ import contextlib
 import importlib.util
 import logging
 import os
-import signal
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +13,8 @@ from giril_rl.errors import INTERRUPTED, UserError
 from giril_rl.study.logs import begin_log
 from giril_rl.study.plan import StudyRun
 
-KILLED = -int(signal.SIGKILL)
-"""The code of a run whose worker is gone."""
+KILLED = -9
+"""The code of a run whose worker is gone: that of SIGKILL, which Windows does not name."""
 
 
 class RayLauncher:
@@ -26,12 +25,13 @@ class RayLauncher:
 
     Args:
         address: the cluster's address, ``auto`` for one that runs on this machine.
+        per_gpu: how many runs share a GPU; None where no run uses one.
 
     Raises:
-        UserError: where Ray is not installed, or no cluster answers.
+        UserError: where Ray is not installed, no cluster answers, or it has no GPU for the runs.
     """
 
-    def __init__(self, address: str) -> None:
+    def __init__(self, address: str, *, per_gpu: int | None = None) -> None:
         if importlib.util.find_spec("ray") is None:
             raise UserError(
                 'launcher=ray needs the package ray: pip install "giril-rl[ray]", or leave it out.'
@@ -46,18 +46,32 @@ class RayLauncher:
                 f"no Ray cluster answers at ray_address={address}: start one with "
                 "`ray start --head`, or give its address."
             ) from error
+        self._per_gpu = per_gpu
+        if per_gpu is not None and not self._resource("GPU"):
+            ray.shutdown()
+            raise UserError(
+                f"device=cuda, and the Ray cluster at ray_address={address} has no GPU: leave "
+                "device=cpu, or add a machine that has one."
+            )
         # One run a process: `max_calls` ends the worker after it, as a command ends.
         self._remote = ray.remote(max_retries=0, max_calls=1)(run_in_worker)
         self._running: dict[Any, StudyRun] = {}
 
     @property
     def slots(self) -> int:
-        """How many CPUs the cluster has at the moment."""
-        return max(int(self._ray.cluster_resources().get("CPU", 1)), 1)
+        """How many CPUs the cluster has at the moment, or places on its GPUs where runs use one."""
+        cpus = int(self._resource("CPU"))
+        if self._per_gpu is not None:
+            cpus = min(cpus, int(self._resource("GPU")) * self._per_gpu)
+        return max(cpus, 1)
+
+    def _resource(self, name: str) -> float:
+        return self._ray.cluster_resources().get(name, 0)
 
     def start(self, run: StudyRun, log: Path) -> None:
         """Hand a run to the cluster; what it prints is added to ``log``."""
-        task = self._remote.options(num_cpus=run.config.threads, name=run.name)
+        gpus = 1 / (self._per_gpu or 1) if run.config.device == "cuda" else 0
+        task = self._remote.options(num_cpus=run.config.threads, num_gpus=gpus, name=run.name)
         reference = task.remote(run.command, str(log.absolute()), str(Path.cwd()))
         self._running[reference] = run
 

@@ -92,7 +92,7 @@ class Planner:
         Args:
             spec: the study.
             changes: ``key=value`` texts that take the place of every group's own, where its recipe
-                has that knob; ``seed`` and ``steps`` not of a ``player``, nor ``steps`` of cloning.
+                has that knob; ``steps`` not of a ``player``, nor of cloning.
 
         Raises:
             UserError: in one sentence, naming the group, for an unknown recipe or key, a wrong type
@@ -134,9 +134,7 @@ class Planner:
         # What no recipe has is left in, to be refused; so are choices such as the task.
         changes = [text for text in changes if text in shared or _has(schema, text)]
         kept: tuple[str, ...] = ()
-        if group.player:  # With another seed or budget it would be nobody's expert.
-            kept = ("seed=", "steps=")
-        elif _clones(schema):  # A budget of environment steps says nothing here.
+        if group.player or _clones(schema):  # With another budget it would be nobody's expert.
             kept = ("steps=",)
         changes = [text for text in changes if not text.startswith(kept)]
         own = [text.partition("=")[0] for text in changes]

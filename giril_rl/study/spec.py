@@ -25,7 +25,7 @@ class Group:
         recipes: names of recipes or paths of copied ones.
         knobs: ``{dotted key: value}``; see :func:`override_text` for lists.
         player: whether its runs are the experts that the others record, which the command line's
-            ``seed=`` and ``steps=`` are not for.
+            ``steps=`` is not for.
     """
 
     label: str

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 
 import torch
@@ -10,7 +11,7 @@ from torch import Tensor, nn
 from giril_rl.networks.acting import ActingPolicy
 from giril_rl.networks.agents import Agent
 from giril_rl.networks.policy import ActorCritic
-from giril_rl.training.recorded import record
+from giril_rl.training.recorded import CannotRecord, record
 
 
 def collecting(agent: Agent, *, compile: bool = False) -> ActingPolicy:
@@ -34,7 +35,8 @@ class RecordedActing(ActingPolicy):
 
     The same numbers from the same random ones, bit for bit, in some 60% of the time, which makes
     training on a simulator of tens of microseconds some 4% faster. Weights and statistics may
-    change in place, as an optimizer and ``load_state_dict`` change them, but not be replaced.
+    change in place, as an optimizer and ``load_state_dict`` change them, but not be replaced. An
+    agent of which no graph can be recorded acts without, which a warning says.
 
     Args:
         agent: policy and value network.
@@ -54,25 +56,44 @@ class RecordedActing(ActingPolicy):
         self._act = _Act(agent)
         self._compile = compile
         self._graph: Callable[..., tuple[Tensor, ...]] | None = None
-        self._shape = torch.Size()
+        self._attributes = vars(agent)  # Its "training" without a module's slow look-up.
+        self._kind: tuple[torch.Size, bool] = (torch.Size(), False)
         self._state: list[Tensor] = []
+        self._recorded = True
 
     def act(self, observation: Tensor) -> tuple[Tensor, ...]:
-        """A draw for the observations; another shape of them is recorded anew."""
-        if self._graph is None or observation.shape != self._shape:
-            self._graph = self._record(observation)
+        """A draw for the observations; for another shape or mode of the agent recorded anew."""
+        kind = observation.shape, self._attributes["training"]
+        if self._graph is None or kind != self._kind:
+            self._graph, self._kind = self._prepared(observation), kind
         return self._graph(observation, *self._state)
 
-    def _record(self, observation: Tensor) -> Callable[..., tuple[Tensor, ...]]:
+    def _prepared(self, observation: Tensor) -> Callable[..., tuple[Tensor, ...]]:
         named = {**dict(self._act.named_parameters()), **dict(self._act.named_buffers())}
         self._state = [x.detach() for x in named.values()]
-        self._shape = observation.shape
+
+        def eager(seen: Tensor, *state: Tensor) -> tuple[Tensor, ...]:
+            return self._act(seen)
 
         def act(seen: Tensor, *state: Tensor) -> tuple[Tensor, ...]:
             given = dict(zip(named, state, strict=True))
-            return torch.func.functional_call(self._act, given, (seen,))
+            out = torch.func.functional_call(self._act, given, (seen,))
+            if any(given[name] is not x for name, x in zip(named, state, strict=True)):
+                raise CannotRecord("it puts another tensor in the place of a buffer")
+            return out
 
-        return record(act, [observation, *self._state], compile=self._compile)
+        if self._recorded:
+            inputs = [observation, *self._state]
+            try:
+                return record(act, inputs, eager=eager, compile=self._compile)
+            except CannotRecord as error:
+                self._recorded = False
+                warnings.warn(
+                    "the policy acts as it is, with the same numbers and more time in Python, for "
+                    f"it cannot be recorded: {error}.",
+                    stacklevel=2,
+                )
+        return eager
 
 
 class _Act(nn.Module):
@@ -82,5 +103,5 @@ class _Act(nn.Module):
         super().__init__()
         self.agent = agent
 
-    def forward(self, observation: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def forward(self, observation: Tensor) -> tuple[Tensor, ...]:
         return self.agent.act(observation)

@@ -9,7 +9,7 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from giril_rl.configs import AdversarialConfig
-from giril_rl.randomness import restore_rng, rng_state, seeded
+from giril_rl.randomness import restore_rng, rng_state, seeded, stream_seed
 from giril_rl.rewards.bottleneck_loss import BottleneckLoss
 from giril_rl.rewards.discriminator_loss import DiscriminatorLoss
 from giril_rl.training.traced import TracedGradients
@@ -56,7 +56,7 @@ class AdversarialLearner:
         self._expert = [expert.get(key).contiguous().to(device) for key in self._pair_keys]
         self.optimizer = torch.optim.Adam(self.gradients.parameters, lr=cfg.lr, fused=True)
         self._device = device
-        with seeded(seed, device):
+        with seeded(stream_seed("reward", seed), device):
             self._rng = rng_state(device)
 
     def update(self, batch: TensorDictBase) -> dict[str, float]:

@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
+from contextlib import closing
 from pathlib import Path
 
 from giril_rl.configs import PPOConfig, TaskConfig
 from giril_rl.envs import BatchedEnv, make_env
 from giril_rl.errors import UserError
 from giril_rl.networks.agents import Agent, agent_for, fits, load_agent_from
-from giril_rl.randomness import seeded
+from giril_rl.randomness import Use, seeded, stream_seed
 
 POLICY = "policy"
 """The folder of a run that holds its policy, see :class:`giril_rl.pretrained.Pretrained`."""
 
 
-def make_agent(env: BatchedEnv, cfg: PPOConfig, seed: int) -> Agent:
-    """An untrained agent for ``env``, initialised from ``seed`` alone.
+def make_agent(env: BatchedEnv, cfg: PPOConfig, seed: int, *, use: Use = "training") -> Agent:
+    """An untrained agent for ``env``, initialised from ``use`` and ``seed`` alone.
 
     Examples:
         >>> import torch
@@ -24,7 +25,7 @@ def make_agent(env: BatchedEnv, cfg: PPOConfig, seed: int) -> Agent:
         >>> make_agent(env, PPOConfig(), seed=0).critic(torch.zeros(1, 4)).shape
         torch.Size([1, 1])
     """
-    with seeded(seed):
+    with seeded(stream_seed(use, seed)):
         return agent_for(env, hidden=cfg.hidden, normalise=cfg.normalise_observations)
 
 
@@ -38,9 +39,8 @@ def load_agent(run: Path, task: TaskConfig) -> Agent:
     if not folder.is_dir():
         raise UserError(f"{run} holds no trained policy: run it to its end first.")
     agent = load_agent_from(folder)
-    env = make_env(task, 1, seed=0)
-    fitting = fits(agent, env)
-    env.close()
+    with closing(make_env(task, 1, seed=0)) as env:
+        fitting = fits(agent, env)
     if not fitting:
         raise UserError(f"{folder} does not fit {task.name}: it belongs to another task's run.")
     return agent

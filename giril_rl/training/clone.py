@@ -18,6 +18,7 @@ from giril_rl.networks.agents import Agent
 from giril_rl.networks.normalise import RunningNormaliser
 from giril_rl.networks.policy import NORMALISED
 from giril_rl.progress import progress
+from giril_rl.randomness import stream_seed
 from giril_rl.rewards.chunks import PIXELS_AT_ONCE
 from giril_rl.training.finite import Finite
 from giril_rl.training.interrupt import Interrupt, Interrupted
@@ -49,6 +50,8 @@ def clone_behaviour(
     steps and never fitted; with "fixed" they are those of the last step, and ``held_out`` is only
     logged.
 
+    Box actions are fitted in the policy's own units, in which the bounds are -1 and 1.
+
     The loss of a Box action says nothing of the sampling policy's deviation. It is set at the end
     to the root mean squared error of the mean action, which is its maximum of likelihood, on the
     held-out pairs, or on the fitted ones with "fixed"; at least ``cfg.min_std``.
@@ -56,7 +59,8 @@ def clone_behaviour(
     Args:
         agent: the policy; its actor, normaliser and deviation are changed in place.
         fitted: pairs to fit, batch ``(n,)``, with ``"observation"`` (raw) and ``"action"`` as
-            executed: within the bounds of Box actions, integers for Discrete ones.
+            executed: Box actions in the environment's units and within the bounds, Discrete ones as
+            integers or one-hot vectors.
         cfg: settings.
         seed: seeds the minibatches, where there are any.
         run: where metrics and checkpoints go.
@@ -85,7 +89,7 @@ def clone_behaviour(
     optimizer = torch.optim.AdamW(
         agent.actor.parameters(), lr=cfg.lr, weight_decay=cfg.weight_decay, fused=True
     )
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(stream_seed("training", seed))
     step, seconds = 0, 0.0
     best: dict[str, Any] = {"step": 0, "loss": float("inf"), "actor": {}}
     saved = run.load(phase)
@@ -116,7 +120,7 @@ def clone_behaviour(
             bar.update(block, loss=f"{losses['fitted']:.3g}")
             metrics = {f"{phase}/{name}/loss": value for name, value in losses.items()}
             run.log(step, metrics, phase=phase)
-            finite.losses(metrics, step)
+            finite.losses(metrics, step, sets["fitted"])
             asked = interrupt.requested
             if step % CHECKPOINT_EVERY < block or step == cfg.steps or asked:
                 seconds = time.perf_counter() - began
@@ -132,7 +136,7 @@ def clone_behaviour(
             if asked:
                 break
     if interrupt.requested:  # At the end as well, for the run may have more to do.
-        raise Interrupted.at(step, cfg.steps, "gradient steps")
+        raise Interrupted.at(step, cfg.steps, "gradient steps", part="behaviour cloning")
     if cfg.stop == "held_out":
         agent.actor.load_state_dict(best["actor"])
     set_deviation(agent, sets["held_out" if cfg.stop == "held_out" else "fitted"], cfg.min_std)
@@ -145,8 +149,8 @@ def set_deviation(agent: Agent, pairs: TensorDictBase, least: float) -> None:
 
     Args:
         agent: the policy; one for Discrete actions is left as it is.
-        pairs: ``"normalised"`` observations and ``"action"``.
-        least: smallest deviation, in units of the action.
+        pairs: ``"normalised"`` observations and ``"action"``, in the policy's own units.
+        least: smallest deviation, in the same units: of half the range of a bounded action.
 
     Examples:
         >>> from torchrl.data import Bounded
@@ -175,9 +179,15 @@ def _loss(agent: Agent) -> BCLoss:
 
 
 def _pairs(agent: Agent, data: TensorDictBase) -> TensorDict:
+    """Normalised observations and what the actor's output is fitted to."""
     data = data.to(agent.device)
     normalised = agent.normaliser(data.get("observation"))
-    return TensorDict({NORMALISED: normalised, "action": data.get("action")}, data.shape)
+    action = data.get("action")
+    if agent.bounds is not None:
+        action = agent.bounds.inverse(action)
+    elif agent.discrete and action.ndim > data.ndim:
+        action = action.long().argmax(-1)
+    return TensorDict({NORMALISED: normalised, "action": action}, data.shape)
 
 
 def _mean_loss(loss: BCLoss, pairs: TensorDict) -> float:

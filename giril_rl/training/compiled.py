@@ -63,8 +63,10 @@ def _compiling() -> Iterator[None]:
     torch's cache, broken. They inherit which signals are blocked; this process stops at the next
     safe point, as ever.
     """
-    resource_tracker.ensure_running()  # Where that is left to torch, it unblocks the signals.
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
+    masks = hasattr(signal, "pthread_sigmask")  # Windows has no signals to block.
+    if masks:
+        resource_tracker.ensure_running()  # Where that is left to torch, it unblocks the signals.
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
     try:
         yield
     except TorchDynamoException as error:
@@ -75,4 +77,5 @@ def _compiling() -> Iterator[None]:
             "and for a GPU Triton; what was saved before is as it was."
         ) from error
     finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        if masks:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)

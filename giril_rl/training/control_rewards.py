@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import torch
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 
 from giril_rl.configs import ControlRunConfig
@@ -18,6 +19,7 @@ from giril_rl.training.fit import fit_reward
 from giril_rl.training.metrics import METRICS, read_metrics
 from giril_rl.training.reward_models import copy_reward, curiosity_reward, generative_reward
 from giril_rl.training.run import Run
+from giril_rl.transforms.intrinsic import device_of
 
 
 def control_reward(
@@ -36,19 +38,20 @@ def control_reward(
     """
     if demo is None:
         return ConstantReward(), {}
+    pairs = subsample(demo, cfg.demo.subsample)
     if cfg.reward == "copy":
-        return copy_reward(cfg.giril, env, demo).to(cfg.device), {}
+        return copy_reward(cfg.giril, env, pairs).to(cfg.device), {}
     part = cfg.icm if cfg.reward == "untrained_icm" else cfg.giril
     seed = cfg.seed if part.seed is None else part.seed
     seeds = {"reward": seed}
     if cfg.reward == "untrained_icm":
-        return curiosity_reward(cfg.icm, env, demo, seed=seed).to(cfg.device), seeds
-    reward = generative_reward(cfg.giril, env, demo, seed=seed).to(cfg.device)
+        return curiosity_reward(cfg.icm, env, pairs, seed=seed).to(cfg.device), seeds
+    reward = generative_reward(cfg.giril, env, pairs, seed=seed).to(cfg.device)
     if cfg.reward == "untrained_giril":
         return reward, seeds
     fit_reward(
         GenerativeRewardLoss(reward, alpha=cfg.giril.alpha),
-        subsample(demo, cfg.demo.subsample),
+        pairs,
         cfg.fit,
         seed=seed,
         run=run,
@@ -56,7 +59,7 @@ def control_reward(
     )
     if cfg.reward == "negated_giril":
         return AffineReward(reward, scale=-1.0), seeds
-    mean, variance = moments(reward, demo)
+    mean, variance = moments(reward, pairs)
     # A resumed run has them already, before the rows that it continues.
     if not any(row.get("phase") == "moments" for row in read_metrics(run.folder / METRICS)):
         run.log(0, {"moments/mean": mean, "moments/variance": variance}, phase="moments")
@@ -66,22 +69,20 @@ def control_reward(
 
 
 @torch.no_grad()
-def moments(reward: TensorDictModuleBase, demo: Demonstration) -> tuple[float, float]:
-    """Mean and (population) variance of a reward over all transitions of a demonstration.
+def moments(reward: TensorDictModuleBase, data: TensorDictBase) -> tuple[float, float]:
+    """Mean and (population) variance of a reward over transitions.
 
     Args:
         reward: a module that writes one key, one value per transition.
-        demo: the demonstration, which is left as it is.
+        data: the transitions, which are left as they are.
 
     Examples:
         >>> from tensordict import TensorDict
-        >>> demo = Demonstration(TensorDict({"observation": torch.zeros(4, 2)}, [4]))
-        >>> moments(ConstantReward(3.0), demo)
+        >>> data = TensorDict({"observation": torch.zeros(4, 2)}, [4])
+        >>> moments(ConstantReward(3.0), data)
         (3.0, 0.0)
     """
-    view = demo.transitions.select(*reward.in_keys)
-    weight = next(reward.parameters(), None)
-    values = (
-        reward(view if weight is None else view.to(weight.device)).get(reward.out_keys[0]).double()
-    )
+    view = data.select(*reward.in_keys)
+    device = device_of(reward)
+    values = reward(view if device is None else view.to(device)).get(reward.out_keys[0]).double()
     return values.mean().item(), values.var(correction=0).item()

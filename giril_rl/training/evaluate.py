@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager, nullcontext
 from dataclasses import asdict, dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import torch
 from tensordict import TensorDictBase
-from torch import Tensor
+from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from giril_rl.configs import TaskConfig
-from giril_rl.envs import for_scores, make_env
-from giril_rl.randomness import seeded
+from giril_rl.envs import BatchedEnv, for_scores, make_env
+from giril_rl.networks.agents import check_actions
+from giril_rl.progress import progress
+from giril_rl.randomness import Use, seeded, stream_seed
+
+EPISODES_AT_ONCE = 20
+"""Simulators that an evaluation has at a time; one of PyBullet's takes 30 MB."""
 
 
 class Player(Protocol):
@@ -51,22 +57,32 @@ def evaluate(
     episodes: int,
     seed: int,
     deterministic: bool,
+    use: Use = "evaluation",
+    show_progress: bool = True,
 ) -> Scores:
     """Plays each of ``episodes`` fresh environments for exactly one episode.
 
     One episode per environment, whatever its length: counting the first ones to end would favour
-    short episodes. Torch's random state is put back afterwards.
+    short episodes. No more than :data:`EPISODES_AT_ONCE` are played at a time. Each has a seed of
+    its own, by its number alone; the random numbers of sampled actions are shared by those that are
+    played together. Torch's random state is put back afterwards.
 
     Args:
-        agent: the policy; its running normalisation is used as it is and not updated.
+        agent: the policy, played in eval mode; its running normalisation is used as it is and not
+            updated.
         task: the task to play; always its own episodes and whole games, whatever
             ``task.horizon`` and ``task.episode`` say.
         episodes: number of episodes.
         seed: root of the episodes' seeds and seed of the sampled actions.
         deterministic: play the distribution's mode rather than samples.
+        use: what the episodes are for.
+        show_progress: show a progress bar.
 
     Returns:
         The scores; the standard deviation is the sample's (n - 1), 0 for one episode.
+
+    Raises:
+        UserError: if the agent was made for other actions than the task's.
 
     Examples:
         >>> from giril_rl.networks.policy import ActorCritic
@@ -78,27 +94,28 @@ def evaluate(
         >>> scores.episodes, scores.return_mean == scores.episode_length_mean
         (5, True)
     """
-    env = make_env(for_scores(task), episodes, seed)
     policy = agent.acting()
     mode = ExplorationType.DETERMINISTIC if deterministic else ExplorationType.RANDOM
-    returns = torch.zeros(episodes, dtype=torch.float64)
-    lengths = torch.zeros(episodes, dtype=torch.int64)
-    playing = torch.ones(episodes, dtype=torch.bool)
-    lives = 0
+    played: list[_Played] = []
     device = getattr(agent, "device", torch.device("cpu"))
-    with seeded(seed, device), torch.no_grad(), set_exploration_type(mode):
-        tensordict = env.reset()
-        while playing.any():
-            tensordict, following = env.step_and_maybe_reset(policy(tensordict))
-            reward: Tensor = tensordict.get(("next", "reward")).squeeze(-1)
-            returns[playing] += reward[playing].double()
-            lengths += playing
-            life_over = tensordict.get(("next", "life_over"), None)
-            if life_over is not None:
-                lives += int(life_over.squeeze(-1)[playing].sum())
-            playing &= ~tensordict.get(("next", "done")).squeeze(-1)
-            tensordict = following
-    env.close()
+    counted = progress(episodes, desc="evaluation", unit="episodes") if show_progress else None
+    with (
+        seeded(stream_seed(use, seed), device),
+        torch.no_grad(),
+        set_exploration_type(mode),
+        _in_eval_mode(agent),
+        counted or nullcontext(),
+    ):
+        for first in range(0, episodes, EPISODES_AT_ONCE):
+            count = min(EPISODES_AT_ONCE, episodes - first)
+            env = make_env(for_scores(task), count, seed, use=use)
+            env.first_index = first
+            with closing(env):
+                check_actions(agent, env)
+                played.append(_play(env, policy, counted))
+    returns = torch.cat([part.returns for part in played])
+    lengths = torch.cat([part.lengths for part in played])
+    lives = sum(part.lives for part in played)
     return Scores(
         return_mean=returns.mean().item(),
         return_std=returns.std().item() if episodes > 1 else 0.0,
@@ -108,6 +125,52 @@ def evaluate(
         episodes=episodes,
         returns=returns.tolist(),
     )
+
+
+class _Played(NamedTuple):
+    returns: Tensor
+    lengths: Tensor
+    lives: int
+
+
+def _play(
+    env: BatchedEnv, policy: Callable[[TensorDictBase], TensorDictBase], bar: progress | None
+) -> _Played:
+    """Plays one episode in each simulator."""
+    count = env.batch_size[0]
+    returns = torch.zeros(count, dtype=torch.float64)
+    lengths = torch.zeros(count, dtype=torch.int64)
+    playing = torch.ones(count, dtype=torch.bool)
+    lives = 0
+    tensordict = env.reset()
+    while playing.any():
+        tensordict, following = env.step_and_maybe_reset(policy(tensordict))
+        reward: Tensor = tensordict.get(("next", "reward")).squeeze(-1)
+        returns[playing] += reward[playing].double()
+        lengths += playing
+        life_over = tensordict.get(("next", "life_over"), None)
+        if life_over is not None:
+            lives += int(life_over.squeeze(-1)[playing].sum())
+        ended = playing & tensordict.get(("next", "done")).squeeze(-1)
+        playing &= ~ended
+        if bar is not None and ended.any():
+            bar.update(int(ended.sum()))
+        tensordict = following
+    return _Played(returns, lengths, lives)
+
+
+@contextmanager
+def _in_eval_mode(agent: Player) -> Iterator[None]:
+    """Neither drops units nor updates batch statistics, whatever the mode that training left."""
+    modules = agent.modules() if isinstance(agent, nn.Module) else ()
+    training = [module for module in modules if module.training]
+    for module in training:
+        module.training = False
+    try:
+        yield
+    finally:
+        for module in training:
+            module.training = True
 
 
 def evaluate_both(

@@ -8,7 +8,7 @@ import json
 import math
 import sys
 from collections.abc import Iterator
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -23,15 +23,16 @@ from giril_rl.demos import Demonstration, check_demonstration, record_demonstrat
 from giril_rl.demos.task import as_recorded_task, check_environment, spaces_of
 from giril_rl.envs import gym_factory, make_env, with_own_episodes
 from giril_rl.errors import UserError
-from giril_rl.files import remove_leftovers
+from giril_rl.files import missing, remove_empty, remove_leftovers
 from giril_rl.imports import import_modules, modules_of
-from giril_rl.naming import out_folder, safe, without_added
+from giril_rl.naming import NO_EFFECT, out_folder, safe, without_added
 from giril_rl.networks.agents import Agent
 from giril_rl.randomness import check_device
 from giril_rl.shipped import demonstration_folder
 from giril_rl.task_defaults import apply_task_defaults
 from giril_rl.training.agent import load_agent, make_agent
 from giril_rl.training.finished import read_result
+from giril_rl.training.outlook import announce
 from giril_rl.training.ppo import train_ppo
 from giril_rl.training.result import finish_run
 from giril_rl.training.run import Run
@@ -40,12 +41,13 @@ from giril_rl.training.scaling import return_scaling
 REWARD = [("next", "reward")]
 
 
-def train_expert(cfg: ExpertRunConfig, folder: Path) -> dict[str, Any]:
+def train_expert(cfg: ExpertRunConfig, folder: Path, *, recipe: str = "expert") -> dict[str, Any]:
     """Trains PPO on the true reward and scores it, or returns what an earlier run left.
 
     Args:
         cfg: the expert's settings.
         folder: the run's folder.
+        recipe: the recipe's name.
 
     Returns:
         The contents of ``result.json``.
@@ -54,11 +56,11 @@ def train_expert(cfg: ExpertRunConfig, folder: Path) -> dict[str, Any]:
         Interrupted: after a checkpoint, if the user asked for it with Ctrl-C.
     """
     check_task(cfg)
-    with Run.open(folder, asdict(cfg), recipe="expert", logger=cfg.logger) as run:
+    with Run.open(folder, asdict(cfg), recipe=recipe, logger=cfg.logger) as run:
         if run.finished:
             return read_result(folder)
-        env = make_env(cfg.task, cfg.ppo.num_envs, cfg.seed)
-        agent = make_agent(env, cfg.ppo, cfg.seed).to(cfg.device)
+        env = run.closing(make_env(cfg.task, cfg.ppo.num_envs, cfg.seed, use="player"))
+        agent = make_agent(env, cfg.ppo, cfg.seed, use="player").to(cfg.device)
         relabel = (
             [SignTransform(REWARD)]
             if cfg.clip_reward
@@ -73,8 +75,9 @@ def train_expert(cfg: ExpertRunConfig, folder: Path) -> dict[str, Any]:
             seed=cfg.seed,
             run=run,
             stop_at=cfg.task.expert_score if cfg.stop_early else None,
+            use="player",
         )
-        return finish_run(run, cfg, agent, trained, method="expert")
+        return finish_run(run, cfg, agent, trained)
 
 
 def obtain_expert(cfg: RunConfig, expert: ExpertConfig) -> tuple[Path, dict[str, Any]]:
@@ -113,7 +116,7 @@ def expert_settings(cfg: RunConfig, expert: ExpertConfig) -> ExpertRunConfig:
             threads=cfg.threads,
             device=cfg.device,
             steps=expert.steps_on(cfg.task),
-            seed=expert.seed,
+            seed=cfg.seed if expert.seed is None else expert.seed,
             stop_early=expert.stop_early,
         )
     )
@@ -140,14 +143,15 @@ def check_inputs(cfg: RunConfig, expert: ExpertConfig, demo: DemoConfig) -> None
     """
     check_task(cfg)
     if demo.path is not None:
-        _given_demonstration(cfg.task, demo.path)
+        _given_demonstration(cfg, demo.path)
     elif expert.path is not None:
         folder, _ = obtain_expert(cfg, expert)
         load_agent(folder, cfg.task)
 
 
-def _given_demonstration(task: TaskConfig, path: str) -> Demonstration:
-    folder = demonstration_folder(path, task)
+def _given_demonstration(cfg: RunConfig, path: str) -> Demonstration:
+    task = cfg.task
+    folder = demonstration_folder(path, task, cfg.seed)
     shape, spec = spaces_of(task)
     demo = Demonstration.load(folder)
     try:
@@ -169,12 +173,15 @@ def obtain_demonstration(
     Raises:
         UserError: if the demonstration does not fit the task.
     """
+    settings = expert_settings(cfg, expert)
+    has_player = (out_folder("expert", settings, {}) / "result.json").exists()
+    announce(cfg, expert, demo, has_player=has_player)
     if demo.path is not None:
-        given = _given_demonstration(cfg.task, demo.path)
+        given = _given_demonstration(cfg, demo.path)
         return given, _known_expert(given)
     source, result = obtain_expert(cfg, expert)
     task = as_recorded_task(cfg.task, demo.lives)
-    folder = Path(cfg.root) / demonstration_place(cfg.task, demo, result["config_hash"])
+    folder = Path(cfg.root) / demonstration_place(cfg, demo, result["config_hash"])
     with made_once(folder, "demonstration"):
         remove_leftovers(folder)
         if not folder.exists():
@@ -182,12 +189,12 @@ def obtain_demonstration(
             recorded = record_demonstration(
                 gym_factory(task),
                 _player(agent, deterministic=demo.deterministic),
-                seed=demo.seed,
+                seed=cfg.seed if demo.seed is None else demo.seed,
                 length=demo.length,
                 episodes=demo.episodes,
                 deterministic=demo.deterministic,
                 task=task.name,
-                expert={"return_mean": result["return_mean"], "seed": result["seed"]},
+                expert={key: result[key] for key in ("return_mean", "seed", "env_steps")},
                 lives=demo.lives if task.is_atari else None,
             )
             recorded.save(folder)
@@ -202,28 +209,29 @@ def _known_expert(demo: Demonstration) -> dict[str, Any] | None:
     return None
 
 
-def demonstration_place(task: TaskConfig, demo: DemoConfig, expert: str) -> Path:
+def demonstration_place(cfg: RunConfig, demo: DemoConfig, expert: str) -> Path:
     """Where a recorded demonstration lies below the root of runs.
 
     Args:
-        task: the recipe's task.
+        cfg: the recipe's settings, of which task and seed count.
         demo: what is recorded.
         expert: the expert's ``config_hash``.
 
     Examples:
-        >>> pong = TaskConfig(name="pong", env_id="ALE/Pong-v5")
+        >>> pong = RunConfig(task=TaskConfig(name="pong", env_id="ALE/Pong-v5"))
         >>> demonstration_place(pong, DemoConfig(), "0123456789ab").parent.as_posix()
         'demos/pong'
     """
-    identity = _identity(as_recorded_task(task, demo.lives), demo, expert)
-    return Path("demos") / safe(task.name) / identity
+    demo = replace(demo, seed=cfg.seed if demo.seed is None else demo.seed)
+    identity = _identity(as_recorded_task(cfg.task, demo.lives), demo, expert)
+    return Path("demos") / safe(cfg.task.name) / identity
 
 
 def _identity(task: TaskConfig, demo: DemoConfig, expert: str) -> str:
     """Twelve hex digits of what decides a demonstration."""
     unread = {"path", "subsample"} | (set() if task.is_atari else {"lives"})
     chosen = {key: value for key, value in asdict(demo).items() if key not in unread}
-    parts = without_added({"demo": chosen, "task": asdict(task)})
+    parts = without_added({"demo": chosen, "task": asdict(task)}, drop=NO_EFFECT)
     identity = json.dumps([parts["demo"], parts["task"], expert], sort_keys=True)
     return hashlib.sha256(identity.encode()).hexdigest()[:12]
 
@@ -242,7 +250,11 @@ def _player(agent: Agent, *, deterministic: bool) -> Any:
 
 @contextlib.contextmanager
 def made_once(folder: Path, what: str) -> Iterator[None]:
-    """Lets one process make ``folder`` while others that want it wait."""
+    """Lets one process make ``folder`` while others that want it wait.
+
+    Where that is refused, nothing is left behind.
+    """
+    made = missing(folder.parent)
     folder.parent.mkdir(parents=True, exist_ok=True)
     lock = FileLock(str(folder.parent / f".{folder.name}.lock"))
     try:
@@ -250,7 +262,14 @@ def made_once(folder: Path, what: str) -> Iterator[None]:
     except Timeout:
         print(f"waiting for another run that is making the {what} {folder}", file=sys.stderr)
         lock.acquire()
+    refused = False
     try:
         yield
+    except UserError:
+        refused = not folder.exists()
+        raise
     finally:
         lock.release()
+        if refused:
+            Path(lock.lock_file).unlink(missing_ok=True)
+            remove_empty(made)

@@ -161,9 +161,9 @@ def score_anew(folder: Path, settings: EvalConfig) -> None:
 
 def _player(folder: Path, task: TaskConfig, result: dict[str, Any]) -> Player:
     """Who played a finished run's scores."""
-    if result["method"] == RANDOM:
+    if result.get("random_policy") or result["method"] == RANDOM:
         return RandomPolicy.of_task(task, result["seed"])
-    if result["method"] == HELD_ACTION:
+    if "held_action" in result or result["method"] == HELD_ACTION:
         return HeldAction.of_task(task, result.get("held_action", -1))
     return load_agent(folder, task)
 

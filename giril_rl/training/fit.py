@@ -12,7 +12,7 @@ from torchrl.objectives import LossModule
 
 from giril_rl.configs import FitConfig
 from giril_rl.progress import progress
-from giril_rl.randomness import restore_rng, rng_state, seeded
+from giril_rl.randomness import restore_rng, rng_state, seeded, stream_seed
 from giril_rl.rewards.chunks import PIXELS_AT_ONCE
 from giril_rl.training.finite import Finite
 from giril_rl.training.interrupt import Interrupt, Interrupted
@@ -47,7 +47,7 @@ def fit_reward(
         phase: name of the checkpoint and of the metrics.
 
     Returns:
-        Seconds of fitting, those of earlier processes included.
+        Seconds of fitting, those of earlier processes included; ``run.fit_seconds`` counts them.
 
     Raises:
         Interrupted: after a checkpoint, if the user asked for it with Ctrl-C.
@@ -60,8 +60,8 @@ def fit_reward(
     data = data.to(device)
     held_out = None if held_out is None else held_out.to(device)
     columns = [data.get(key).contiguous() for key in keys]
-    generator = torch.Generator().manual_seed(seed)
-    torch.manual_seed(seed)
+    generator = torch.Generator().manual_seed(stream_seed("reward", seed))
+    torch.manual_seed(stream_seed("reward", seed))
     step, seconds = 0, 0.0
     saved = run.load(phase)
     if saved is not None:
@@ -87,7 +87,7 @@ def fit_reward(
             bar.update(block)
             losses = _evaluate(loss, {"fitted": data, "held_out": held_out})
             run.log(step, losses, phase=phase)
-            finite.losses(losses, step)
+            finite.losses(losses, step, data.select(*keys))
             asked = interrupt.requested
             if step % CHECKPOINT_EVERY < block or step == cfg.steps or asked:
                 state = {
@@ -102,9 +102,12 @@ def fit_reward(
             if asked:
                 break
     if interrupt.requested:  # At the end as well, for the run may have more to do.
-        raise Interrupted.at(step, cfg.steps, "fitting steps")
+        raise Interrupted.at(step, cfg.steps, "fitting steps", part="the reward model's fit")
     loss.eval()
-    return time.perf_counter() - began if saved is None or step > saved["step"] else seconds
+    if saved is None or step > saved["step"]:
+        seconds = time.perf_counter() - began
+    run.fit_seconds += seconds
+    return seconds
 
 
 def _evaluate(loss: nn.Module, sets: dict[str, TensorDictBase | None]) -> dict[str, float]:

@@ -38,9 +38,10 @@ def find_demonstration(folder: Path, within: Path) -> Demonstration | None:
     demo = read_part(folder, config, "demo", DemoConfig)
     place: Path | None
     if demo.path is not None and is_shipped(demo.path):
-        place = demonstration_folder(demo.path, read_part(folder, config, "task", TaskConfig))
+        task = read_part(folder, config, "task", TaskConfig)
+        place = demonstration_folder(demo.path, task, result["seed"])
     else:
-        places = _places(folder, within, config, demo)
+        places = _places(folder, within, config, result, demo)
         place = next((path for path in places if _is_inside(path / "card.json", within)), None)
     if place is None:
         return None
@@ -48,7 +49,9 @@ def find_demonstration(folder: Path, within: Path) -> Demonstration | None:
     return found if len(found) == result.get("demo_transitions") else None
 
 
-def _places(folder: Path, within: Path, config: dict[str, Any], demo: DemoConfig) -> Iterator[Path]:
+def _places(
+    folder: Path, within: Path, config: dict[str, Any], result: dict[str, Any], demo: DemoConfig
+) -> Iterator[Path]:
     """Where the demonstration may lie."""
     if demo.path is not None:
         yield from _readings(demo.path, folder, within)
@@ -58,16 +61,17 @@ def _places(folder: Path, within: Path, config: dict[str, Any], demo: DemoConfig
         raise UserError(f"{folder / 'config.yaml'}: root={root}: text is needed.")
     task = read_part(folder, config, "task", TaskConfig)
     expert = read_part(folder, config, "expert", ExpertConfig)
+    run = RunConfig(task=task, seed=result["seed"])
     made_by = None
     if expert.path is None:
-        made_by = config_hash(expert_settings(RunConfig(task=task), expert))
+        made_by = config_hash(expert_settings(run, expert))
     else:
         for place in _readings(expert.path, folder, within):
             if _is_inside(place / "result.json", within):
                 made_by = str(read_result(place)["config_hash"])
                 break
     if made_by is not None:
-        below = demonstration_place(task, demo, made_by)
+        below = demonstration_place(run, demo, made_by)
         for place in (*_readings(root, folder, within), *_above(folder, within)):
             yield place / below
 

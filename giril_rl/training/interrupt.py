@@ -18,10 +18,27 @@ class Interrupted(KeyboardInterrupt):
     """
 
     @classmethod
-    def at(cls, done: int, total: int, unit: str = "steps") -> Interrupted:
-        """The exception with the sentence that tells the user where the run stands."""
+    def at(
+        cls, done: int, total: int, unit: str = "steps", *, part: str = "", most: bool = False
+    ) -> Interrupted:
+        """The exception with the sentence that tells the user where the run stands.
+
+        Args:
+            done: how much is done and saved.
+            total: how much there is to do.
+            unit: what is counted.
+            part: the part of the run that was interrupted, such as "the player's training".
+            most: says that the part may end before ``total``.
+
+        Examples:
+            >>> str(Interrupted.at(2_000, 5_000_000, part="the player's training", most=True))
+            "interrupted in the player's training at 2,000 of at most 5,000,000 steps: the same
+            command continues from there"
+        """
+        where, bound = f" in {part}" if part else "", "at most " if most else ""
         return cls(
-            f"interrupted at {done:,} of {total:,} {unit}: the same command continues from there"
+            f"interrupted{where} at {done:,} of {bound}{total:,} {unit}: the same command "
+            "continues from there"
         )
 
 

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-from giril_rl.errors import UserError
+from giril_rl.errors import INTERRUPTED, UserError
 from giril_rl.files import name_file, write_atomically
 from giril_rl.untrusted import parse_json
 
@@ -116,18 +116,47 @@ def check_logger(name: str | None) -> None:
 
 
 def make_logger(name: LoggerName, folder: Path) -> Any:
-    """The TorchRL logger ``name`` (``torchrl.record.loggers``) that writes under ``folder``.
+    """What writes the measurements of one run, of which a process may have several at a time.
 
-    TensorBoard files are in ``folder/tensorboard``, CSV files in ``folder/csv``; Weights & Biases
-    and MLflow name the run after the folder.
+    TensorBoard files are in ``folder/tensorboard``, CSV files in ``folder/csv``, both of TorchRL's
+    loggers; Weights & Biases and MLflow name the run after the folder. A resumed run continues the
+    same run of either, which is known by the folder's path.
+
+    Returns:
+        An object with TorchRL's ``log_metrics(values, step)``, to be ended by :func:`end_logger`.
     """
     check_logger(name)
+    place = folder.resolve()
+    identity = f"{place.name}-{zlib.crc32(str(place).encode()):08x}"
+    if name == "mlflow":
+        from giril_rl.training.mlflow_run import MLflowRun
+
+        return MLflowRun(folder / name, folder.name, identity)
     from torchrl.record.loggers.utils import get_logger
 
     if name in ("tensorboard", "csv"):
         return get_logger(name, str(folder / name), "")
-    # A resumed run continues the same W&B run, whose id is made of the folder's path.
-    place = folder.resolve()
-    identity = f"{place.name}-{zlib.crc32(str(place).encode()):08x}"
-    wandb_kwargs = {"project": "giril_rl", "id": identity, "resume": "allow"}
+    wandb_kwargs = {
+        "project": "giril_rl",
+        "id": identity,
+        "resume": "allow",
+        # Else the run that is open in this process would be handed out again.
+        "reinit": "create_new",
+    }
     return get_logger(name, str(folder / name), folder.name, wandb_kwargs=wandb_kwargs)
+
+
+def end_logger(logger: Any, error: BaseException | None = None) -> None:
+    """Ends what :func:`make_logger` began.
+
+    Args:
+        logger: what it returned.
+        error: why the run ended before its time, if it did.
+    """
+    stopped = isinstance(error, KeyboardInterrupt)
+    if hasattr(logger, "end"):
+        logger.end("FINISHED" if error is None else "KILLED" if stopped else "FAILED")
+    elif hasattr(logger.experiment, "finish"):
+        logger.experiment.finish(exit_code=0 if error is None else INTERRUPTED if stopped else 1)
+    elif hasattr(logger.experiment, "close"):
+        logger.experiment.close()

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import time
+import warnings
 from collections import deque
-from typing import TYPE_CHECKING, Any, NamedTuple
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, Concatenate, NamedTuple, ParamSpec
 
 import torch
 from tensordict import TensorDictBase
@@ -17,9 +20,9 @@ from torchrl.objectives.value import GAE
 from giril_rl.configs import PPOConfig
 from giril_rl.envs import BatchedEnv
 from giril_rl.errors import UserError
-from giril_rl.networks.agents import Agent
+from giril_rl.networks.agents import Agent, check_actions
 from giril_rl.progress import progress
-from giril_rl.randomness import restore_rng, rng_state
+from giril_rl.randomness import Use, restore_rng, rng_state, stream_seed
 from giril_rl.training.acting import collecting
 from giril_rl.training.episodes import EpisodeTracker
 from giril_rl.training.finite import Finite
@@ -27,23 +30,53 @@ from giril_rl.training.interrupt import Interrupt, Interrupted
 from giril_rl.training.restoring import restoring
 from giril_rl.training.threads import made_on_one_thread
 from giril_rl.training.traced import TracedGradients
+from giril_rl.transforms.batch_mean import BatchMeanReward
+from giril_rl.transforms.scaling import NonFiniteReward, ReturnScaling
 
 if TYPE_CHECKING:
     from giril_rl.training.reward_learner import RewardLearner
     from giril_rl.training.run import Run
 
-LEARNER_KEYS = ("action", "action_log_prob", "advantage", "value_target")
+LEARNER_KEYS = ("action_log_prob", "advantage", "value_target")
+"""What PPO's loss reads of a minibatch, besides the networks' inputs and the agent's draws."""
 NO_FAILURE = "no_failure"
 """Stands for ``"terminated"`` where a failure is taken for a time limit: False everywhere."""
 
 
 class Trained(NamedTuple):
-    """How long a training was."""
+    """What a training was.
+
+    Attributes:
+        steps: environment steps.
+        seconds: wall-clock seconds.
+        inexact_resumes: how often it was resumed without its running episodes.
+        averaged: whether its rewards were averaged over the environments.
+    """
 
     steps: int
     seconds: float
+    inexact_resumes: int = 0
+    averaged: bool = False
 
 
+Rest = ParamSpec("Rest")
+
+
+def _closing_env(
+    train: Callable[Concatenate[BatchedEnv, Rest], Trained],
+) -> Callable[Concatenate[BatchedEnv, Rest], Trained]:
+    @functools.wraps(train)
+    def closing(env: BatchedEnv, *args: Rest.args, **kwargs: Rest.kwargs) -> Trained:
+        try:
+            return train(env, *args, **kwargs)
+        finally:
+            if not env.is_closed:  # By the collector.
+                env.close()
+
+    return closing
+
+
+@_closing_env
 def train_ppo(
     env: BatchedEnv,
     agent: Agent,
@@ -57,15 +90,17 @@ def train_ppo(
     stop_at: float | None = None,
     learn_reward: RewardLearner | None = None,
     termination: str = "ends",
+    use: Use = "training",
 ) -> Trained:
     """Trains ``agent`` in place on the reward that ``relabel`` writes; resumes by itself.
 
     The environment's own reward is read for the log, before ``relabel`` replaces it, and by
     nothing that reaches the learner. Checkpoints hold everything that the rest of the run depends
-    on, the simulators' state included, so that an interrupted run ends with the same weights.
+    on, the simulators' state included, so that an interrupted run ends with the same weights. Where
+    a simulator does not repeat itself, the run goes on from fresh episodes, and says so.
 
     Args:
-        env: the training environments; closed at the end.
+        env: the training environments; closed at the end, however that comes.
         agent: policy and value network; where its weights are, batches go and learning happens.
         relabel: a transform or a composition of them, called with each batch ``(num_envs, time)``;
             its ``state_dict`` is checkpointed.
@@ -80,30 +115,36 @@ def train_ppo(
         learn_reward: trains the reward model beside the policy, on each batch before ``relabel``
             uses it; its state is checkpointed.
         termination: "ends" or "bootstrap", see :class:`PPOLearner`.
+        use: what the random numbers are for: "training", or "player" for an expert.
 
     Returns:
-        Environment steps and seconds, those of earlier processes included.
+        Environment steps, seconds and inexact resumes, those of earlier processes included.
 
     Raises:
+        UserError: if the agent was made for other actions than the environment's.
         Interrupted: after a checkpoint, if the user asked for it with Ctrl-C.
         RunError: if a loss or a weight is no longer finite; the last checkpoint stays.
     """
+    check_actions(agent, env)
     steps = cfg.whole_batches(steps)
     relabel.to(agent.device)
     learner = PPOLearner(agent, cfg, total_steps=steps, termination=termination)
     tracker = EpisodeTracker(cfg.num_envs)
     recent: deque[float] = deque(maxlen=20)
     parts = nn.ModuleDict({"agent": agent, "tracker": tracker, "relabel": relabel})
-    taken = 0
+    averaged = any(isinstance(part, BatchMeanReward) for part in relabel.modules())
+    taken, inexact, exact = 0, 0, True
     saved = run.load(phase)
     if saved is not None:
         with restoring(run, phase):
             taken = saved["steps"]
+            inexact = saved.get("inexact_resumes", 0)  # Not in those of earlier versions.
             recent.extend(saved["recent"])
             if taken >= steps or saved["stopped"]:
                 parts.load_state_dict(saved["parts"])
-                return Trained(taken, saved["seconds"])
-            env.restore_simulator(saved["simulator"])
+                return Trained(taken, saved["seconds"], inexact, averaged)
+            exact = env.restore_simulator(saved["simulator"])
+            inexact += not exact
     batch_size = cfg.num_envs * cfg.rollout
     collector = Collector(
         env,
@@ -118,7 +159,7 @@ def train_ppo(
         return_same_td=True,
     )
     # Only now, for making a collector may draw random numbers.
-    torch.manual_seed(seed)
+    torch.manual_seed(stream_seed(use, seed))
     if saved is not None:
         with restoring(run, phase):
             parts.load_state_dict(saved["parts"])
@@ -126,6 +167,14 @@ def train_ppo(
             if learn_reward is not None:
                 learn_reward.load_state_dict(saved["reward_learner"])
             restore_rng(saved["rng"])
+    if not exact:
+        warnings.warn(
+            "the simulator did not come back to where it was saved (it does not repeat itself, or "
+            f"is another version): this run goes on at {taken:,} steps from fresh episodes, which "
+            "result.json counts in inexact_resumes.",
+            stacklevel=2,
+        )
+        forget_episodes(parts)
     run.truncate_metrics(phase, taken)
     next_save = (taken // cfg.checkpoint_every + 1) * cfg.checkpoint_every
     stopped = False
@@ -145,8 +194,14 @@ def train_ppo(
             recent.extend(returns.tolist())
             if agent.device.type != "cpu":
                 batch = batch.to(agent.device)
+            finite.observations(batch, taken + batch_size)
             learned = {} if learn_reward is None else learn_reward.update(batch)
-            losses = learner.learn(relabel(batch), taken)
+            finite.losses(learned, taken + batch_size)  # Before its reward is used.
+            try:
+                batch = relabel(batch)
+            except NonFiniteReward as error:
+                raise finite.error(error.what, taken + batch_size, "data") from error
+            losses = learner.learn(batch, taken)
             taken += batch_size
             metrics = {f"{phase}/{k}": v for k, v in losses.items()}
             metrics.update(learned)
@@ -159,7 +214,7 @@ def train_ppo(
                 true_return = f"{metrics['train/return_mean']:,.1f}"
             bar.update(batch_size, true_return=true_return)
             run.log(taken, metrics, phase=phase)
-            finite.losses({**learned, **losses}, taken)
+            finite.losses(losses, taken, batch.select(("next", "reward")))
             if stop_at is not None and len(recent) == recent.maxlen:
                 stopped = sum(recent) / len(recent) >= stop_at
             asked = interrupt.requested
@@ -170,6 +225,7 @@ def train_ppo(
                 state = {
                     "steps": taken,
                     "seconds": time.perf_counter() - began,
+                    "inexact_resumes": inexact,
                     "stopped": stopped,
                     "recent": list(recent),
                     "parts": dict(parts.state_dict()),
@@ -182,8 +238,19 @@ def train_ppo(
             if stopped or asked:
                 break
     if interrupt.requested:  # At the end as well, for the run may have more to do.
-        raise Interrupted.at(taken, steps)
-    return Trained(taken, time.perf_counter() - began)
+        whose = "player" if run.recipe == "expert" else "policy"
+        raise Interrupted.at(taken, steps, part=f"the {whose}'s training", most=stop_at is not None)
+    return Trained(taken, time.perf_counter() - began, inexact, averaged)
+
+
+def forget_episodes(parts: nn.Module) -> None:
+    """Clears the sums over running episodes, whose rest is lost."""
+    for part in parts.modules():
+        if isinstance(part, EpisodeTracker):
+            part.running_return.zero_()
+            part.running_length.zero_()
+        elif isinstance(part, ReturnScaling) and part.reset_rule == "done":
+            part.running_return.zero_()
 
 
 class PPOLearner:
@@ -231,7 +298,12 @@ class PPOLearner:
             functional=False,
         )
         # The clipped value loss compares with the value as it was.
-        self.keys = (*agent.input_keys, *LEARNER_KEYS, *["state_value"] * cfg.clip_value)
+        self.keys = (
+            *agent.input_keys,
+            agent.drawn_key,
+            *LEARNER_KEYS,
+            *["state_value"] * cfg.clip_value,
+        )
         self.gradients = TracedGradients(
             loss,
             keys=self.keys,

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import cast
 
 import torch
+from tensordict import TensorDictBase
 
 from giril_rl.configs import (
     AdversarialConfig,
@@ -12,8 +13,8 @@ from giril_rl.configs import (
     CuriosityConfig,
     GenerativeConfig,
 )
-from giril_rl.demos import Demonstration
 from giril_rl.envs import BatchedEnv
+from giril_rl.randomness import stream_seed
 from giril_rl.rewards import (
     BottleneckReward,
     CopyReward,
@@ -30,14 +31,14 @@ from giril_rl.rewards import (
 
 
 def generative_reward(
-    cfg: GenerativeConfig, env: BatchedEnv, demo: Demonstration, *, seed: int
+    cfg: GenerativeConfig, env: BatchedEnv, data: TensorDictBase, *, seed: int
 ) -> GenerativeReward:
     """GIRIL's reward module, to be fitted.
 
     Args:
         cfg: its settings, of which ``alpha`` is the loss's and ``seed`` the caller's to resolve.
         env: the environment, for its specs.
-        demo: the demonstration, all of whose observations the scaler is fitted to.
+        data: the demonstrated transitions to learn from, to which the scaler is fitted.
         seed: seed of weights and noise. The global random state is neither read nor changed.
 
     Examples:
@@ -46,8 +47,8 @@ def generative_reward(
         >>> from giril_rl.configs import TaskConfig
         >>> from giril_rl.envs import make_env
         >>> env = make_env(TaskConfig(name="cartpole", env_id="CartPole-v1"), num_envs=1, seed=0)
-        >>> demo = Demonstration(TensorDict({"observation": torch.rand(9, 4)}, [9]))
-        >>> generative_reward(GenerativeConfig(), env, demo, seed=0).scaler
+        >>> data = TensorDict({"observation": torch.rand(9, 4)}, [9])
+        >>> generative_reward(GenerativeConfig(), env, data, seed=0).scaler
         ObservationScaler(4, rule='standardise', clamp=True)
     """
     prior = cast(Prior, cfg.prior)
@@ -60,7 +61,7 @@ def generative_reward(
             scale=cfg.scale,
             prior=prior,
             clamp=cfg.clamp,
-            seed=seed,
+            seed=stream_seed("reward", seed),
         )
     else:
         reward = GenerativeReward.for_vectors(
@@ -72,21 +73,21 @@ def generative_reward(
             prior=prior,
             normalise=cast(ScalingRule, cfg.normalise),
             clamp=cfg.clamp,
-            seed=seed,
+            seed=stream_seed("reward", seed),
         )
-    reward.scaler.fit(demo.transitions["observation"])
+    reward.scaler.fit(data.get("observation"))
     return reward
 
 
 def curiosity_reward(
-    cfg: CuriosityConfig, env: BatchedEnv, demo: Demonstration, *, seed: int
+    cfg: CuriosityConfig, env: BatchedEnv, data: TensorDictBase, *, seed: int
 ) -> CuriosityReward:
     """CDIL's reward module, to be fitted.
 
     Args:
         cfg: its settings, of which ``features`` is the loss's and ``seed`` the caller's to resolve.
         env: the environment, for its specs.
-        demo: the demonstration, all of whose observations the scaler is fitted to.
+        data: the demonstrated transitions to learn from, to which the scaler is fitted.
         seed: seed of the weights. The global random state is neither read nor changed.
 
     Examples:
@@ -95,14 +96,14 @@ def curiosity_reward(
         >>> from giril_rl.configs import TaskConfig
         >>> from giril_rl.envs import make_env
         >>> env = make_env(TaskConfig(name="cartpole", env_id="CartPole-v1"), num_envs=1, seed=0)
-        >>> demo = Demonstration(TensorDict({"observation": torch.rand(9, 4)}, [9]))
-        >>> curiosity_reward(CuriosityConfig(), env, demo, seed=0).scaler
+        >>> data = TensorDict({"observation": torch.rand(9, 4)}, [9])
+        >>> curiosity_reward(CuriosityConfig(), env, data, seed=0).scaler
         ObservationScaler(4, rule='standardise', clamp=True)
     """
     frames, size = _observation(env)
     if frames:
         reward = CuriosityReward.for_pixels(
-            env.action_spec, channels=frames, scale=cfg.scale, seed=seed
+            env.action_spec, channels=frames, scale=cfg.scale, seed=stream_seed("reward", seed)
         )
     else:
         reward = CuriosityReward.for_vectors(
@@ -113,19 +114,19 @@ def curiosity_reward(
             scale=cfg.scale,
             normalise=cast(ScalingRule, cfg.normalise),
             clamp=cfg.clamp,
-            seed=seed,
+            seed=stream_seed("reward", seed),
         )
-    reward.scaler.fit(demo.transitions["observation"])
+    reward.scaler.fit(data.get("observation"))
     return reward
 
 
-def copy_reward(cfg: GenerativeConfig, env: BatchedEnv, demo: Demonstration) -> CopyReward:
+def copy_reward(cfg: GenerativeConfig, env: BatchedEnv, data: TensorDictBase) -> CopyReward:
     """The reward of the copy predictor, on GIRIL's scale.
 
     Args:
         cfg: GIRIL's settings.
         env: the environment, for its specs.
-        demo: the demonstration that the scaler is fitted to.
+        data: the demonstrated transitions to learn from, to which the scaler is fitted.
     """
     frames, size = _observation(env)
     scaler: ObservationScaler | PixelScaler
@@ -133,25 +134,26 @@ def copy_reward(cfg: GenerativeConfig, env: BatchedEnv, demo: Demonstration) -> 
         scaler = PixelScaler(clamp=cfg.clamp)
     else:
         scaler = ObservationScaler(size, rule=cast(ScalingRule, cfg.normalise), clamp=cfg.clamp)
-    return CopyReward(scaler.fit(demo.transitions["observation"]), scale=cfg.scale)
+    return CopyReward(scaler.fit(data.get("observation")), scale=cfg.scale)
 
 
 def discriminator_reward(
-    cfg: AdversarialConfig, env: BatchedEnv, demo: Demonstration, *, seed: int
+    cfg: AdversarialConfig, env: BatchedEnv, data: TensorDictBase, *, seed: int
 ) -> DiscriminatorReward:
     """GAIL's reward module, to be trained beside the policy.
 
     Args:
         cfg: its settings, of which those of its training are the learner's.
         env: the environment, for its specs.
-        demo: the demonstration that the scaler is fitted to, unless it follows the policy.
+        data: the demonstrated transitions to learn from, to which the scaler is fitted unless it
+            follows the policy.
         seed: seed of the weights. The global random state is neither read nor changed.
     """
     form = cast(RewardForm, cfg.form)
     frames, size = _observation(env)
     if frames:
         reward = DiscriminatorReward.for_pixels(
-            env.action_spec, channels=frames, form=form, seed=seed
+            env.action_spec, channels=frames, form=form, seed=stream_seed("reward", seed)
         )
     else:
         reward = DiscriminatorReward.for_vectors(
@@ -161,28 +163,33 @@ def discriminator_reward(
             form=form,
             normalise=cast(DiscriminatorScaling, cfg.normalise),
             clamp=cfg.clamp,
-            seed=seed,
+            seed=stream_seed("reward", seed),
         )
-    reward.fit_scaler(demo.transitions["observation"])
+    reward.fit_scaler(data.get("observation"))
     return reward
 
 
 def bottleneck_reward(
-    cfg: BottleneckConfig, env: BatchedEnv, demo: Demonstration, *, seed: int
+    cfg: BottleneckConfig, env: BatchedEnv, data: TensorDictBase, *, seed: int
 ) -> BottleneckReward:
     """VAIL's reward module, to be trained beside the policy.
 
     Args:
         cfg: its settings, see :func:`discriminator_reward`.
         env: the environment, for its specs.
-        demo: the demonstration that the scaler is fitted to, unless it follows the policy.
+        data: the demonstrated transitions to learn from, to which the scaler is fitted unless it
+            follows the policy.
         seed: seed of the weights. The global random state is neither read nor changed.
     """
     form = cast(RewardForm, cfg.form)
     frames, size = _observation(env)
     if frames:
         reward = BottleneckReward.for_pixels(
-            env.action_spec, channels=frames, form=form, latent=cfg.latent, seed=seed
+            env.action_spec,
+            channels=frames,
+            form=form,
+            latent=cfg.latent,
+            seed=stream_seed("reward", seed),
         )
     else:
         reward = BottleneckReward.for_vectors(
@@ -193,9 +200,9 @@ def bottleneck_reward(
             normalise=cast(DiscriminatorScaling, cfg.normalise),
             clamp=cfg.clamp,
             latent=cfg.latent,
-            seed=seed,
+            seed=stream_seed("reward", seed),
         )
-    reward.fit_scaler(demo.transitions["observation"])
+    reward.fit_scaler(data.get("observation"))
     return reward
 
 

@@ -2,26 +2,39 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import warnings
 from collections.abc import Collection, Mapping
 from pathlib import Path
 from types import TracebackType
-from typing import Any
+from typing import Any, TypeVar
 
 import yaml
 from filelock import FileLock, Timeout
 
 from giril_rl.errors import UserError, told
-from giril_rl.files import installed_versions, name_file, read_json, write_atomically, write_json
+from giril_rl.files import (
+    installed_versions,
+    missing,
+    name_file,
+    read_json,
+    remove_empty,
+    write_atomically,
+    write_json,
+)
 from giril_rl.formats import RUN_FORMAT, check_run_format
 from giril_rl.naming import NO_EFFECT, without_added
 from giril_rl.places import cannot_write, check_place
 from giril_rl.schema import flat
 from giril_rl.sources import sources_of
 from giril_rl.training.checkpoint import load_state, save_state
-from giril_rl.training.metrics import METRICS, MetricsFile, check_logger, make_logger
+from giril_rl.training.metrics import METRICS, MetricsFile, check_logger, end_logger, make_logger
 from giril_rl.untrusted import parse_yaml, read_text
+
+FIRST_FILES = ("config.yaml", "versions.json")
+"""What a run's folder holds before its first part has come to anything."""
+Closable = TypeVar("Closable")
 
 
 class Run:
@@ -42,6 +55,7 @@ class Run:
         recipe: the recipe's name.
         config: the resolved configuration, as given.
         versions: what ``versions.json`` holds.
+        fit_seconds: what fitting reward models took, earlier processes included.
 
     Examples:
         >>> import tempfile
@@ -62,10 +76,14 @@ class Run:
     def __init__(self, folder: Path, config: dict[str, Any], recipe: str, logger: str | None):
         self.folder, self.config, self.recipe = folder, config, recipe
         self.versions: dict[str, Any] = installed_versions()
+        self.fit_seconds = 0.0
         self._logger_name = logger
         self._logger: Any = None
         self._metrics: MetricsFile
         self._lock = FileLock(str(folder / ".lock"), thread_local=False)
+        self._open_parts = contextlib.ExitStack()
+        self._new = not (folder / "config.yaml").exists()
+        self._made = missing(folder)
 
     @classmethod
     def open(
@@ -94,7 +112,7 @@ class Run:
         check_place(Path(folder), "out=")
         run = cls(Path(folder), config, recipe, logger)
         run._refuse_foreign_folder()
-        check_run_format(run.folder)
+        check_run_format(run.folder, [RUN_FORMAT])
         try:
             run.folder.mkdir(parents=True, exist_ok=True)
             run._lock.acquire(blocking=False)
@@ -115,10 +133,26 @@ class Run:
             run._write_config()
             run._write_versions()
             run._metrics = MetricsFile(run.folder / METRICS)
-        except BaseException:
-            run.close()
+        except BaseException as error:
+            run.close(error)
             raise
         return run
+
+    def closing(self, part: Closable) -> Closable:
+        """``part`` itself, closed at the latest with the run, however that ends.
+
+        Examples:
+            >>> import tempfile
+            >>> from giril_rl.configs import TaskConfig
+            >>> from giril_rl.envs import make_env
+            >>> task = TaskConfig(name="cartpole", env_id="CartPole-v1")
+            >>> with Run.open(tempfile.mkdtemp(), {}, recipe="mine") as run:
+            ...     env = run.closing(make_env(task, num_envs=1, seed=0))
+            >>> env.is_closed
+            True
+        """
+        self._open_parts.callback(_close, part)
+        return part
 
     def log(self, step: int, values: Mapping[str, float], *, phase: str) -> None:
         """Append one row to ``metrics.jsonl``, and to the logger if there is one.
@@ -134,8 +168,7 @@ class Run:
         try:
             if self._logger is None:
                 self._logger = make_logger(self._logger_name, self.folder)  # type: ignore[arg-type]
-            for key, value in values.items():
-                self._logger.log_scalar(key, float(value), step=step)
+            self._logger.log_metrics({key: float(value) for key, value in values.items()}, step)
         except OSError as error:
             name_file(error, self.folder)
             raise
@@ -171,13 +204,29 @@ class Run:
         """Write ``result.json``, which marks the run as finished."""
         write_json(self.folder / "result.json", result)
 
-    def close(self) -> None:
-        """Let another process have the folder."""
-        experiment: Any = getattr(self._logger, "experiment", None)
-        if hasattr(experiment, "close"):
-            experiment.close()
-        self._logger = None
-        self._lock.release()
+    def close(self, error: BaseException | None = None) -> None:
+        """End the logger's run and let another process have the folder.
+
+        A run that was refused before anything came of it leaves no folder.
+
+        Args:
+            error: why the run ended before its time, if it did.
+        """
+        logger, self._logger = self._logger, None
+        try:
+            self._open_parts.close()
+            if logger is not None:
+                end_logger(logger, error)
+        finally:
+            held = {path.name for path in self.folder.glob("*")}
+            refused = isinstance(error, UserError) and self._new and held <= {*FIRST_FILES, ".lock"}
+            if refused:
+                for name in FIRST_FILES:
+                    (self.folder / name).unlink(missing_ok=True)
+            self._lock.release()
+            if refused:
+                (self.folder / ".lock").unlink(missing_ok=True)
+                remove_empty(self._made)
 
     def __enter__(self) -> Run:
         return self
@@ -188,7 +237,7 @@ class Run:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        self.close()
+        self.close(error)
 
     def _refuse_foreign_folder(self) -> None:
         if not self.folder.exists() or (self.folder / "config.yaml").exists():
@@ -255,6 +304,11 @@ class Run:
                 )
         content = {"format_version": RUN_FORMAT, **self.versions}
         write_json(path, {**content, "sources": sources} if sources else content)
+
+
+def _close(part: Any) -> None:
+    if not getattr(part, "is_closed", False):  # An environment of TorchRL's, closed by a collector.
+        part.close()
 
 
 def _differences(

@@ -32,7 +32,7 @@ def main() -> None:
     args = parser.parse_args()
     warnings.simplefilter("ignore")
     torch.set_num_threads(args.threads)
-    demo = subsample(Demonstration.load(shipped_demonstrations()["breakout"]), 4)
+    demo = subsample(Demonstration.load(shipped_demonstrations()["breakout"][0]), 4)
     env = make_env(named_task("breakout", None), 1, seed=0)
     loss = GenerativeRewardLoss(GenerativeReward.for_pixels(env.action_spec).to(args.device))
     # The first steps choose algorithms, and each block ends with the losses of the whole set.

@@ -103,6 +103,7 @@ def test_export_and_import_give_the_same_bits(case, form, capsys):
     )
     again = Demonstration.load("again")
     assert_same_bits(again.transitions, demo.transitions)
+    assert again.demo_id == demo.demo_id
     for key in ("seeds", "expert", "deterministic"):
         assert again.card[key] == demo.card[key]
     assert again.card.get("lives") == demo.card.get("lives")
@@ -111,6 +112,27 @@ def test_export_and_import_give_the_same_bits(case, form, capsys):
     assert again.card["source"] == {"format": form, "name": name}
     shown = run(capsys, "show", "again")
     assert f"{name} ({form})" in shown and "same bits" in shown
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.int16, np.int64, np.bool_])
+@pytest.mark.parametrize("form", ["npz", "memmap"])
+def test_vectors_of_whole_numbers_become_float32(form, dtype):
+    """As environments show them and the recorder keeps them."""
+    shown = np.array([[0, 1, 0], [1, 0, 1], [1, 1, 1]] * 2, dtype)
+    columns = {**datasets.columns(), "observation": shown[:5], "next_observation": shown[1:]}
+    if form == "npz":
+        np.savez("whole.npz", **columns)
+        source = "whole.npz"
+    else:
+        data = datasets.tensors()
+        data["observation"] = torch.from_numpy(shown[:5])
+        data["next", "observation"] = torch.from_numpy(shown[1:])
+        data.memmap("whole", copy_existing=True)
+        source = "whole"
+    demo = import_demonstration(source, PENDULUM)
+    for key, wanted in (("observation", shown[:5]), (("next", "observation"), shown[1:])):
+        found = demo.transitions.get(key)
+        assert found.dtype == torch.float32 and found.tolist() == wanted.tolist()
 
 
 def write(form):

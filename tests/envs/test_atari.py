@@ -15,6 +15,7 @@ from giril_rl.envs import AtariEnv, AtariGymEnv, for_scores, gym_factory, make_e
 from giril_rl.envs.atari import Opened
 from giril_rl.envs.atari_game import AtariGame
 from giril_rl.errors import UserError
+from giril_rl.randomness import stream_seed
 from giril_rl.recipes import shipped_conf
 from giril_rl.training import evaluate
 
@@ -161,7 +162,7 @@ def test_whole_game_scores_are_those_of_a_plain_loop(name):
     assert after["next", "game_over"].item()
 
     game = AtariGame(name)
-    _, lives = game.reset(int(np.random.SeedSequence([4, 0, 0]).generate_state(1)[0]))
+    _, lives = game.reset(stream_seed("training", 4, 0, 0, bits=32))
     plain = 0.0
     opening = [1, 2] if game.fires else []
     for action in opening:
@@ -192,7 +193,7 @@ def test_scores_of_an_evaluation_are_those_of_plain_loops():
     returns, steps, lost = [], 0, 0
     for number in range(4):
         game = AtariGame("breakout")
-        _, lives = game.reset(int(np.random.SeedSequence([7, number, 0]).generate_state(1)[0]))
+        _, lives = game.reset(stream_seed("evaluation", 7, number, 0, bits=32))
         shown, score = [game.play(action) for action in (1, 2)][-1], 0.0
         while not shown.over:
             shown = game.play(int(shown.frame.astype(np.int64).sum()) % 4)
@@ -269,8 +270,8 @@ def test_games_are_seeded_now_and_then(monkeypatch):
     env = AtariEnv("breakout", 1, seed=4)
     for _ in range(5):
         env.reset()
-    entropies = [[4, 0, 0], None, [4, 0, 2], None, [4, 0, 4]]
-    assert seeds == [e and int(np.random.SeedSequence(e).generate_state(1)[0]) for e in entropies]
+    first, third, fifth = (stream_seed("training", 4, 0, game, bits=32) for game in (0, 2, 4))
+    assert seeds == [first, None, third, None, fifth]
 
 
 @pytest.mark.parametrize("cap", [108_000, 160])
@@ -283,7 +284,7 @@ def test_a_restored_env_goes_on_as_the_first_would_have(episode, cap, monkeypatc
     state = first.simulator_state()
     assert all(isinstance(value, (int, torch.Tensor)) for value in state.values())
     second = AtariEnv("breakout", 3, episode=episode, seed=99, frame_cap=cap)
-    second.restore_simulator(state)
+    assert second.restore_simulator(state)
     roots = [first._root(torch.from_numpy(first._last_observation.copy())), second.reset()]
     generator = torch.Generator().manual_seed(7)
     ended = 0
@@ -299,13 +300,30 @@ def test_a_restored_env_goes_on_as_the_first_would_have(episode, cap, monkeypatc
     assert ended > 3
 
 
-def test_a_replay_that_ends_elsewhere_is_refused():
-    env = AtariEnv("breakout", 1)
+def test_a_replay_that_ends_elsewhere_begins_the_next_games():
+    env = AtariEnv("breakout", 2, seed=3)
     play(env, 20)
     state = env.simulator_state()
     state["actions"] = state["actions"].clone().fill_(3)
-    with pytest.raises(UserError, match="does not repeat itself"):
-        AtariEnv("breakout", 1).restore_simulator(state)
+    other = AtariEnv("breakout", 2)
+    assert not other.restore_simulator(state)
+    env._between[:] = False
+    assert torch.equal(other.reset()["observation"], env.reset()["observation"])
+    assert torch.equal(other.simulator_state()["episode"], state["episode"] + 1)
+
+
+def test_a_replay_stops_where_a_game_ends_too_early(monkeypatch):
+    env = AtariEnv("breakout", 1)
+    play(env, 20)
+    receive, received = AtariGame.receive, []
+
+    def over_at_once(game):
+        received.append(receive(game))
+        return received[-1]._replace(over=len(received) == 1)
+
+    monkeypatch.setattr(AtariGame, "receive", over_at_once)
+    assert not AtariEnv("breakout", 1).restore_simulator(env.simulator_state())
+    assert len(received) == 1 + 2  # The rest is the next game's opening.
 
 
 @pytest.fixture(scope="module")

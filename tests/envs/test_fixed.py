@@ -10,6 +10,7 @@ from torchrl.envs.utils import check_env_specs
 from giril_rl.configs import TaskConfig
 from giril_rl.envs import FixedHorizonEnv, GymVectorEnv, make_env, with_own_episodes
 from giril_rl.errors import UserError
+from giril_rl.randomness import stream_seed
 from giril_rl.training.checkpoint import load_state, save_state
 
 KEYS = ["observation", "action"] + [
@@ -111,10 +112,11 @@ def test_seeds_of_hidden_resets_are_those_of_the_episodes_numbers():
         moments = jumped[i].nonzero().flatten().tolist()
         assert len(moments) >= 1
         for number, moment in enumerate(moments, 1):
-            seed = int(np.random.SeedSequence([7, i, number]).generate_state(1)[0])
+            seed = stream_seed("training", 7, i, number, bits=32)
             start = gymnasium.make("CartPole-v1").reset(seed=seed)[0]
             np.testing.assert_array_equal(after["following_observation"][i, moment], start)
-            np.testing.assert_array_equal(batch["observation"][i, moment + 1 :][:1], start[None])
+            if moment + 1 < 60:
+                np.testing.assert_array_equal(batch["observation"][i, moment + 1], start)
 
 
 def test_without_a_failure_it_is_the_same_environment():
@@ -185,7 +187,7 @@ def test_a_restored_simulator_continues_bit_for_bit(env_id, limit, after_failure
 
     state = load_state(tmp_path / "state")
     fresh = make_env(settings, 3, seed=99)
-    fresh.restore_simulator(state)
+    assert fresh.restore_simulator(state)
     again = fresh.simulator_state()
     for key, value in state.items():
         assert np.array_equal(again[key], value), key

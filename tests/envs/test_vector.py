@@ -13,8 +13,11 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import check_env_specs
 
 from giril_rl.configs import TaskConfig
+from giril_rl.demos import record_demonstration
 from giril_rl.envs import GymVectorEnv, make_env
 from giril_rl.errors import UserError
+from giril_rl.randomness import stream_seed
+from giril_rl.rewards.actions import ActionEncoder
 from giril_rl.training.checkpoint import load_state, save_state
 
 BULLET = "InvertedPendulumBulletEnv-v0"
@@ -49,8 +52,7 @@ def gymnasium_loop(make_fn, actions, seed):
     columns = {key: [] for key in KEYS}
     for i in range(actions.shape[1]):
         env = make_fn()
-        sequences = (np.random.SeedSequence([seed, i, episode]) for episode in itertools.count())
-        seeds = (int(sequence.generate_state(1)[0]) for sequence in sequences)
+        seeds = (stream_seed("training", seed, i, n, bits=32) for n in itertools.count())
         observation = env.reset(seed=next(seeds))[0].copy()
         rows = {key: [] for key in KEYS}
         for action in actions[:, i].numpy():
@@ -124,6 +126,37 @@ def test_kinds_of_actions(step_counter):
         return env
 
     assert GymVectorEnv(unbounded, 2).action_spec.shape == (2, 2)
+
+
+BOXES = {
+    "half": ([0.0, 0.0], [np.inf, np.inf], [[-3.0, 7.0]], [[0.0, 7.0]]),
+    "one of two": ([-1.0, -np.inf], [1.0, np.inf], [[3.0, -30.0]], [[1.0, -30.0]]),
+    "the largest number": ([-1.0, -3.5e38], [1.0, 3.5e38], [[3.0, -30.0]], [[1.0, -30.0]]),
+    "none": ([-np.inf] * 2, [np.inf] * 2, [[-3.0, 30.0]], [[-3.0, 30.0]]),
+}
+
+
+@pytest.mark.parametrize("case", BOXES)
+def test_each_dimension_is_clamped_to_the_bounds_that_it_has(case, step_counter):
+    low, high, given, executed = BOXES[case]
+
+    def make_fn():
+        env = step_counter(length=99)
+        env.action_space = spaces.Box(np.array(low), np.array(high), dtype=np.float64)
+        return env
+
+    env = GymVectorEnv(make_fn, 1)
+    _, root = play(env, [torch.tensor(given)])
+    assert root["observation"][0, 2] == sum(executed[0])
+    assert env.simulator_state()["actions"].tolist() == [executed]
+    assert ActionEncoder(env.action_spec)(torch.tensor(given)).tolist() == executed
+    demo = record_demonstration(make_fn, lambda o: torch.tensor(given), length=2, seed=0)
+    assert demo.transitions["action"][:1].tolist() == executed
+    # TorchRL draws NaN where a bound is missing.
+    drawn = env.rollout(200)["action"][0]
+    assert drawn.isfinite().all() and drawn.abs().max() < 30
+    inside = (drawn >= torch.tensor(low)) & (drawn <= torch.tensor(high))
+    assert inside.all() and drawn.std(0).min() > 0.3
 
 
 def test_transitions_are_aligned_in_a_collected_batch(step_counter):
@@ -240,7 +273,7 @@ def test_a_restored_simulator_continues_bit_for_bit(env_id, limit, before, tmp_p
 
     state = load_state(tmp_path / "state")
     fresh = make(env_id, seed=99, limit=limit)
-    fresh.restore_simulator(state)
+    assert fresh.restore_simulator(state)
     again = fresh.simulator_state()  # Saved once more before any step: a second interruption.
     for key in ("seed", "episode", "steps", "observation"):
         assert np.array_equal(again[key], state[key]), key
@@ -272,15 +305,34 @@ class Restless(gymnasium.Wrapper):
         return observation + np.random.uniform(size=observation.shape), *rest
 
 
-def test_a_simulator_that_does_not_repeat_itself_is_refused():
+def test_a_simulator_that_does_not_repeat_itself_begins_its_next_episodes():
     def make_fn():
         return Restless(gymnasium.make("CartPole-v1"))
 
-    env = GymVectorEnv(make_fn, 2)
+    env = GymVectorEnv(make_fn, 2, seed=4)
     play(env, random_actions(env, 3))
-    with pytest.raises(UserError, match="does not repeat itself") as raised:
-        GymVectorEnv(make_fn, 2).restore_simulator(env.simulator_state())
-    assert "out=" in str(raised.value)
+    fresh = GymVectorEnv(make_fn, 2)
+    assert not fresh.restore_simulator(env.simulator_state())
+    # A reset is repeatable, so that these are the ones that would have come next.
+    assert torch.equal(fresh.reset()["observation"], env.reset()["observation"])
+    for key in ("seed", "episode", "steps", "actions"):
+        assert np.array_equal(fresh.simulator_state()[key], env.simulator_state()[key]), key
+
+
+def test_a_replay_stops_where_an_episode_ends_too_early(step_counter):
+    """Some simulators raise an error when they are stepped after that."""
+
+    class Strict(step_counter):
+        ended = False
+
+        def step(self, action):
+            assert not self.ended
+            *shown, self.ended, cut, info = super().step(action)
+            return *shown, self.ended, cut, info
+
+    env = GymVectorEnv(lambda: Strict(length=9), 1)
+    play(env, random_actions(env, 5))
+    assert not GymVectorEnv(lambda: Strict(length=2), 1).restore_simulator(env.simulator_state())
 
 
 @pytest.mark.parametrize(
@@ -313,8 +365,9 @@ def test_a_damaged_state_is_refused_before_anything_is_played(env_id, changes, s
         ("observation", spaces.Discrete(4)),
         ("observation", spaces.Dict({"position": spaces.Box(-1, 1, (2,))})),
         ("action", spaces.MultiDiscrete([2, 3])),
-        ("action", spaces.Discrete(3, start=1)),
         ("action", spaces.Box(-1, 1, (2, 2))),
+        ("action", spaces.Discrete(3, start=1)),
+        ("action", spaces.Box(-3, 3, (1,), np.int64)),
     ],
     ids=str,
 )
@@ -327,8 +380,16 @@ def test_other_spaces_are_refused_in_one_sentence(step_counter, name, space):
     with pytest.raises(UserError) as raised:
         GymVectorEnv(make_fn, 1)
     message = str(raised.value)
-    assert message.startswith(f"StepCounter has {name}s of the kind {space}: choose a task with")
+    remedy = {
+        "Discrete(3, start=1)": ", and actions are counted from 0 here: shift them in a wrapper",
+        "Box(-3, 3, (1,), int64)": ", whole numbers, and a policy plays real ones in a Box: give",
+    }.get(str(space), ": choose a task with")
+    assert message.startswith(f"StepCounter has {name}s of the kind {space}{remedy}")
     assert message.endswith(".") and "\n" not in message
+    if name == "action":
+        with pytest.raises(UserError) as recorded:
+            record_demonstration(make_fn, lambda o: o[:, :1], length=3, seed=0)
+        assert str(recorded.value) == message
 
 
 def test_bullet_prints_nothing(capfd):

@@ -1,4 +1,5 @@
 import math
+import re
 
 import pytest
 import torch
@@ -30,6 +31,47 @@ def test_one_hot(dtype):
     action = torch.tensor([[0, 1, 0], [0, 0, 1]], dtype=dtype)
     assert encoder(action).tolist() == [[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
     assert encoder.target(action).tolist() == [1, 2]
+
+
+def test_a_nearly_one_hot_vector_is_not_class_0():
+    encoder = ActionEncoder(OneHot(3))
+    assert encoder.target(torch.tensor([[0.0, 0.0, 0.9999]])).tolist() == [2]
+
+
+INTEGERS = torch.zeros(7, dtype=torch.int64)
+
+
+@pytest.mark.parametrize(
+    ("spec", "action", "needed"),
+    [
+        (OneHot(3), INTEGERS, r"one-hot vectors of shape \(\*batch, 3\)"),
+        (OneHot(3), INTEGERS.unsqueeze(-1), r"one-hot vectors of shape \(\*batch, 3\)"),
+        (OneHot(3), torch.eye(4).bool(), r"one-hot vectors of shape \(\*batch, 3\)"),
+        (Categorical(3), torch.rand(7), r"integers of shape \(\*batch,\)"),
+        (Bounded(-1, 1, shape=(2,)), torch.rand(7, 1), r"vectors of shape \(\*batch, 2\)"),
+    ],
+)
+def test_another_encoding_is_refused(spec, action, needed):
+    encoder = ActionEncoder(spec)
+    for method in (encoder, encoder.target):
+        with pytest.raises(UserError, match=needed) as refusal:
+            method(action)
+        assert f"{action.dtype} of shape {tuple(action.shape)}" in str(refusal.value)
+
+
+@pytest.mark.parametrize(
+    ("spec", "action", "index"),
+    [
+        (Categorical(3), torch.tensor([[0, 2], [-1, 0]]), "[1, 0]"),
+        (Categorical(3), torch.tensor([2, 3]), "[1]"),
+        (OneHot(3), torch.tensor([[0, 1, 0], [0, 0, 0]]), "[1]"),
+        (OneHot(2), torch.tensor([[0.5, 0.5], [0.0, 1.0]]), "[0]"),
+        (OneHot(2), torch.ones(1, 2, dtype=torch.bool), "[0]"),
+    ],
+)
+def test_values_that_are_no_action(spec, action, index):
+    with pytest.raises(UserError, match=rf"index {re.escape(index)} is"):
+        ActionEncoder(spec).check_values(action)
 
 
 def test_box_is_clamped_then_mapped_where_bounded():

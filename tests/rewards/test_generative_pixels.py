@@ -9,8 +9,11 @@ from pixel_data import ACTIONS, convolved, decoded, run_in, scaled, transitions
 from tensordict import TensorDict
 from torch import nn
 from torch.distributions import Independent, Normal, kl_divergence
-from torchrl.data import Categorical
+from torchrl.data import Bounded, Categorical
 
+from giril_rl.errors import UserError
+from giril_rl.networks.pixel_decoder import PixelDecoder
+from giril_rl.networks.pixels import PixelEncoder
 from giril_rl.rewards import (
     ActionEncoder,
     GenerativeReward,
@@ -80,6 +83,75 @@ def test_with_beta_below_1_the_two_parts_are_the_literal_network(clamp, batch):
     assert len(calls) == 1 and torch.equal(reward.get_extra_state(), drawn)
     assert found.shape == (*batch, 1)
     torch.testing.assert_close(found, expected, rtol=1e-5, atol=0)
+
+
+class DarkScaler(PixelScaler):
+    """Half the contrast, darker."""
+
+    def forward(self, observation):
+        return 0.5 * super().forward(observation) - 0.25
+
+
+class AddingDecoder(PixelDecoder):
+    """Predicts the change."""
+
+    def forward(self, code, observation):
+        return super().forward(code, observation) + observation
+
+
+class SmoothActions(ActionEncoder):
+    """Not quite one-hot."""
+
+    def forward(self, action):
+        return 0.9 * super().forward(action) + 0.025
+
+
+def of_parts(actions, scaler=None, decoder=PixelDecoder, **kwargs):
+    torch.manual_seed(0)
+    parts = PixelEncoder(actions.size), decoder(actions.size)
+    with torch.no_grad():
+        parts[1].last.weight.mul_(4)
+        parts[1].painter[0].weight.mul_(100)  # The action matters.
+    return GenerativeReward(*parts, scaler=scaler or PixelScaler(), actions=actions, **kwargs)
+
+
+DISCRETE, BOX = Categorical(ACTIONS), Bounded(-2.0, 2.0, shape=(3,))
+
+
+@pytest.mark.parametrize("beta", [1.0, 0.9])
+@pytest.mark.parametrize(
+    "parts",
+    [
+        {"actions": ActionEncoder(BOX)},
+        {"actions": ActionEncoder(BOX), "scaler": PixelScaler(clamp=False)},
+        {"actions": ActionEncoder(DISCRETE), "scaler": DarkScaler()},
+        {"actions": ActionEncoder(DISCRETE), "decoder": AddingDecoder},
+        {"actions": SmoothActions(DISCRETE)},
+    ],
+    ids=["box", "box, not clamped", "scaler", "decoder", "actions"],
+)
+def test_parts_that_compute_something_else_get_their_own_error(parts, beta):
+    reward, data = of_parts(**parts, beta=beta).eval(), transitions(2, 3)
+    if not reward.actions.discrete:
+        data["action"] = 3 * torch.randn(2, 3, 3)
+    noise = reward.get_extra_state()
+    found = factored(reward, data)
+    reward.set_extra_state(noise)
+    torch.testing.assert_close(found, literal(reward, data), rtol=1e-5, atol=0)
+    with torch.no_grad():
+        reward.set_extra_state(noise)
+        states = data["observation"], data["action"], data["next", "observation"]
+        error = (reward.predict(*states) - reward.scaler(states[2])).square().sum((-3, -2, -1))
+    torch.testing.assert_close(found.squeeze(-1), error, rtol=1e-5, atol=0)
+
+
+def test_channels_come_first():
+    reward, data = model(), transitions(3)
+    for key in ("observation", ("next", "observation")):
+        data[key] = data[key].permute(0, 2, 3, 1)
+    for way in (factored, literal):
+        with pytest.raises(UserError, match=r"\(3, 84, 84, 4\)"):
+            way(reward, data)
 
 
 def test_the_clamp_matters_here():

@@ -42,6 +42,7 @@ def test_there_is_nothing_to_fit_or_to_save():
     ids=["floats", "vectors of bytes", "vectors"],
 )
 def test_other_observations_are_refused(observations):
-    with pytest.raises(UserError, match="uint8") as refusal:
-        PixelScaler().fit(observations)
-    assert str(tuple(observations.shape)) in str(refusal.value)
+    for use in (PixelScaler().fit, PixelScaler()):
+        with pytest.raises(UserError, match="uint8") as refusal:
+            use(observations)
+        assert str(tuple(observations.shape)) in str(refusal.value)

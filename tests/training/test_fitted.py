@@ -32,6 +32,8 @@ def made(tmp_path):
     """``made(recipe, *words)``: a finished run's folder and its settings."""
 
     def write(recipe, *words):
+        if not any(word.startswith("demo.path=") for word in words):
+            words = ("demo.path=null", *words)
         words = ("task=breakout", f"root={tmp_path}", "seed=3", *words)
         found = find(recipe)
         cfg = resolved(found, config_class(found), words)[0]
@@ -70,7 +72,7 @@ def test_the_demonstration_is_found_and_never_made(made, tmp_path, monkeypatch):
     monkeypatch.setattr(fitted, "config_hash", lambda _: made_by)
     assert find_demonstration(folder, tmp_path) is None
     assert {path.name for path in tmp_path.iterdir()} == {"giril"}
-    place = tmp_path / expert.demonstration_place(cfg.task, cfg.demo, made_by)
+    place = tmp_path / expert.demonstration_place(cfg, cfg.demo, made_by)
     Demonstration(transitions()).save(place)
     found = find_demonstration(folder, tmp_path)
     assert torch.equal(found.transitions["observation"], transitions()["observation"])
@@ -93,7 +95,7 @@ def test_a_demonstration_or_an_expert_may_be_given_by_its_path(made, tmp_path):
     assert len(find_demonstration(folder, tmp_path)) == 6
     shutil.rmtree(tmp_path / "giril")
     folder, cfg = made("giril", f"expert.path={tmp_path}/expert")
-    place = tmp_path / expert.demonstration_place(cfg.task, cfg.demo, "ba9876543210")
+    place = tmp_path / expert.demonstration_place(cfg, cfg.demo, "ba9876543210")
     (tmp_path / "given").rename(tmp_path / "moved")
     Demonstration.load(tmp_path / "moved").save(place)
     assert find_demonstration(folder, tmp_path) is None
@@ -107,7 +109,7 @@ def test_a_relative_root_is_found_from_any_current_directory(made, tmp_path, mon
     folder, cfg = made("giril")
     set_to(folder, "root", "study/mine")
     made_by = config_hash(expert.expert_settings(cfg, cfg.expert))
-    place = expert.demonstration_place(cfg.task, cfg.demo, made_by)
+    place = expert.demonstration_place(cfg, cfg.demo, made_by)
     Demonstration(transitions()).save(tmp_path / "study/mine" / place)
     (tmp_path / "giril").rename(tmp_path / "study/giril")
     folder = tmp_path / "study" / folder.relative_to(tmp_path)
@@ -129,9 +131,9 @@ def test_nothing_outside_the_folder_is_read(made, tmp_path, monkeypatch, key, ki
     if key == "expert.path":
         outside.mkdir()
         (outside / "result.json").write_text(json.dumps(RESULT))
-        demo = within / expert.demonstration_place(cfg.task, cfg.demo, RESULT["config_hash"])
+        demo = within / expert.demonstration_place(cfg, cfg.demo, RESULT["config_hash"])
     elif key == "root":
-        demo = outside / expert.demonstration_place(cfg.task, cfg.demo, made_by)
+        demo = outside / expert.demonstration_place(cfg, cfg.demo, made_by)
     Demonstration(transitions()).save(demo)
     (within / "link").symlink_to(outside)
     value = {"absolute": str(outside), "up": "../outside", "link": "link"}[kind]
@@ -164,7 +166,7 @@ def set_to(folder, key, value):
 
 def test_the_packages_own_demonstration_is_found(made, tmp_path):
     folder, _ = made("giril", "demo.path=shipped")
-    shipped = Demonstration.load(shipped_demonstrations()["breakout"])
+    shipped = Demonstration.load(shipped_demonstrations()["breakout"][0])
     assert find_demonstration(folder, tmp_path) is None  # Of six transitions there is none.
     result = {**RESULT, "demo_transitions": len(shipped)}
     (folder / "result.json").write_text(json.dumps(result))

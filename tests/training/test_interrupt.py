@@ -63,3 +63,6 @@ def test_ignored_signal_stays_ignored():
 def test_interrupted_is_a_keyboard_interrupt():
     with pytest.raises(KeyboardInterrupt, match="interrupted at 2,000 of 50,000 batches"):
         raise Interrupted.at(2000, 50_000, "batches")
+    sentence = r"interrupted in the player's training at 2,000 of at most 50,000 steps: the same"
+    with pytest.raises(Interrupted, match=sentence):
+        raise Interrupted.at(2000, 50_000, part="the player's training", most=True)

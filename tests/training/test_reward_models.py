@@ -11,7 +11,6 @@ from giril_rl.configs import (
     GenerativeConfig,
     TaskConfig,
 )
-from giril_rl.demos import Demonstration
 from giril_rl.envs import make_env
 from giril_rl.errors import UserError
 from giril_rl.networks.pixel_decoder import PixelDecoder
@@ -27,8 +26,8 @@ from giril_rl.training.reward_models import (
 )
 
 
-def build_copy(cfg, env, demo, *, seed):
-    return copy_reward(cfg, env, demo)
+def build_copy(cfg, env, data, *, seed):
+    return copy_reward(cfg, env, data)
 
 
 BUILDERS = {
@@ -51,12 +50,12 @@ every_builder = pytest.mark.parametrize("name", BUILDERS)
 
 
 def world(env_id):
-    """An environment, and what a random policy did there as transitions and demonstration."""
+    """An environment, what a random policy did there, and the transitions that a scaler sees."""
     if env_id.startswith("ALE/"):
         pytest.importorskip("ale_py")
     env = make_env(TaskConfig(name="test", env_id=env_id), 2, seed=0)
     batch = env.rollout(3, break_when_any_done=False)
-    return env, batch, Demonstration(batch.reshape(-1).select("observation"))
+    return env, batch, batch.reshape(-1).select("observation")
 
 
 @pytest.fixture(scope="module")
@@ -64,10 +63,10 @@ def breakout():
     return world("ALE/Breakout-v5")
 
 
-def built(name, env, demo, seed=0, **changes):
+def built(name, env, data, seed=0, **changes):
     build, cfg = BUILDERS[name]
     cfg = type(cfg)(**{**vars(cfg), **changes})
-    return build(cfg, env, demo, seed=seed)
+    return build(cfg, env, data, seed=seed)
 
 
 def paid(reward, batch):
@@ -81,42 +80,42 @@ def parts(reward):
 
 @every_builder
 def test_frames(name, breakout):
-    env, batch, demo = breakout
-    reward = built(name, env, demo, normalise="pixels")
+    env, batch, data = breakout
+    reward = built(name, env, data, normalise="pixels")
     assert isinstance(reward.scaler, PixelScaler)
     assert parts(reward) == PIXEL_PARTS[name]
     value = paid(reward, batch)
     assert value.shape == (2, 3, 1) and value.isfinite().all()
-    assert torch.equal(value, paid(built(name, env, demo, normalise="pixels"), batch))
+    assert torch.equal(value, paid(built(name, env, data, normalise="pixels"), batch))
     if name != "copy":
-        assert not torch.equal(value, paid(built(name, env, demo, seed=1), batch))
+        assert not torch.equal(value, paid(built(name, env, data, seed=1), batch))
 
 
 @every_builder
 def test_vectors(name):
-    env, batch, demo = world("CartPole-v1")
-    reward = built(name, env, demo)
+    env, batch, data = world("CartPole-v1")
+    reward = built(name, env, data)
     assert isinstance(reward.scaler, ObservationScaler) and reward.scaler.fitted
     assert parts(reward) == set()
     assert paid(reward, batch).shape == (2, 3, 1)
 
 
 def test_settings_reach_the_models_of_frames(breakout):
-    env, _, demo = breakout
-    giril = built("generative", env, demo, beta=0.6, scale=0.3, clamp=False, prior="standard")
+    env, _, data = breakout
+    giril = built("generative", env, data, beta=0.6, scale=0.3, clamp=False, prior="standard")
     assert (giril.beta, giril.scale, giril.scaler.clamp) == (0.6, 0.3, False)
     assert giril.prior_network is None
-    assert built("curiosity", env, demo, scale=0.3).scale == 0.3
-    copied = built("copy", env, demo, scale=0.3, clamp=False)
+    assert built("curiosity", env, data, scale=0.3).scale == 0.3
+    copied = built("copy", env, data, scale=0.3, clamp=False)
     assert (copied.scale, copied.scaler.clamp) == (0.3, False)
-    assert built("discriminator", env, demo, form="negative").form == "negative"
-    vail = built("bottleneck", env, demo, form="negative", latent=5)
+    assert built("discriminator", env, data, form="negative").form == "negative"
+    vail = built("bottleneck", env, data, form="negative", latent=5)
     assert vail.form == "negative" and vail.head.in_features == 5
 
 
 @pytest.mark.parametrize("name", ["generative", "curiosity", "copy"])
 def test_a_demonstration_of_something_else_is_refused(name, breakout):
     env, _, _ = breakout
-    vectors = Demonstration(TensorDict({"observation": torch.zeros(5, 4)}, [5]))
+    vectors = TensorDict({"observation": torch.zeros(5, 4)}, [5])
     with pytest.raises(UserError, match="uint8"):
         built(name, env, vectors)

@@ -167,3 +167,42 @@ def test_missing_and_unknown_loggers_are_named(tmp_path, monkeypatch):
     check_logger("csv")
     with pytest.raises(UserError, match="unknown"):
         check_logger("printer")
+
+
+def test_a_refused_run_leaves_no_folder(tmp_path):
+    place = tmp_path / "runs" / "giril" / "seed0"
+    with pytest.raises(UserError), Run.open(place, CONFIG, recipe="giril"):
+        raise UserError("the demonstration is empty: record a longer one.")
+    assert list(tmp_path.iterdir()) == []
+    # A folder that was there stays, as it was.
+    place.mkdir(parents=True)
+    with pytest.raises(UserError), Run.open(place, CONFIG, recipe="giril"):
+        raise UserError("the demonstration is empty: record a longer one.")
+    assert list(place.iterdir()) == []
+
+
+@pytest.mark.parametrize("part", ["metrics", "checkpoint", "bug"])
+def test_a_run_of_which_something_came_keeps_its_folder(part, tmp_path):
+    error = ValueError if part == "bug" else UserError
+    with pytest.raises(error), Run.open(tmp_path / "run", CONFIG, recipe="giril") as run:
+        if part == "metrics":
+            run.log(1, {"loss": 1.0}, phase="fit")
+        if part == "checkpoint":
+            run.save("fit", {"step": 1})
+        raise error("stopped")
+    with pytest.raises(UserError), Run.open(tmp_path / "run", CONFIG, recipe="giril"):
+        raise UserError("refused when it continues")
+    assert (tmp_path / "run" / "config.yaml").exists()
+
+
+def test_what_a_run_has_opened_is_closed_with_it(tmp_path):
+    class Simulator:
+        closed = 0
+
+        def close(self):
+            self.closed += 1
+
+    with pytest.raises(RuntimeError), Run.open(tmp_path / "run", {}, recipe="x") as run:
+        simulator = run.closing(Simulator())
+        raise RuntimeError
+    assert simulator.closed == 1

@@ -11,7 +11,7 @@ from giril_rl.files import read_json
 from giril_rl.training.checkpoint import load_state
 from giril_rl.training.metrics import read_metrics
 
-CLOCK = {"wall_seconds", "steps_per_second", "finished_at", "seconds"}
+CLOCK = {"wall_seconds", "fit_seconds", "steps_per_second", "finished_at", "seconds"}
 PLACE = {"out", "root"}
 PNG_END = b"IEND\xaeB`\x82"
 

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 
+import gymnasium
 import pytest
 import torch
 from folders import assert_readable, assert_same, contents
@@ -16,11 +17,12 @@ from torch import nn
 
 from giril_rl.configs import BCConfig, FitConfig, PPOConfig, TaskConfig
 from giril_rl.demos import record_demonstration
-from giril_rl.envs import gym_factory, make_env
+from giril_rl.envs import GymVectorEnv, gym_factory, make_env
 from giril_rl.errors import FAILED, RunError
 from giril_rl.rewards import GenerativeReward, GenerativeRewardLoss
 from giril_rl.training import Run, clone_behaviour, fit_reward, make_agent, train_ppo
 from giril_rl.training.checkpoint import load_state
+from giril_rl.transforms import ReturnScaling
 
 TASK = TaskConfig(name="cartpole", env_id="CartPole-v1")
 SMALL = PPOConfig(num_envs=2, rollout=32, minibatch=64, epochs=1, hidden=[8], checkpoint_every=64)
@@ -101,19 +103,53 @@ class Breaks(nn.Module):
         return batch.set(("next", "reward"), reward)
 
 
+@pytest.mark.parametrize("scaled", [False, True])
 @pytest.mark.parametrize("value", [float("nan"), float("inf")])
-def test_a_reward_that_is_no_number(value, tmp_path):
-    with pytest.raises(
-        RunError, match=r"loss_\w+ is (nan|inf) at 192 of 256 steps: give a smaller"
-    ):
-        trained(tmp_path, Breaks(value))
+def test_a_reward_that_is_no_number(value, scaled, tmp_path):
+    def relabel(value):
+        return nn.Sequential(Breaks(value), *[ReturnScaling()] * scaled)
+
+    what = rf"next reward is {value} at \[0, 5, 0\] of the batch, so that loss_\w+ is \w+"
+    if scaled:
+        what = f"the reward is {value} in environment 0 at step 5 of the batch"
+    with pytest.raises(RunError, match=f"{what} at 192 of 256 steps: see where that comes from"):
+        trained(tmp_path, relabel(value))
     saved = load_state(tmp_path / "ppo.safetensors")
     assert saved["steps"] == 128
     weights = [v for v in saved["parts"].values() if v.is_floating_point()]
     assert weights and all(v.isfinite().all() for v in weights)
     # The same folder goes on from there once its reward is sound.
-    trained(tmp_path, Breaks(1.0))
+    trained(tmp_path, relabel(1.0))
     assert load_state(tmp_path / "ppo.safetensors")["steps"] == 256
+
+
+class BadSensor(gymnasium.Wrapper):
+    """From its 80th step on one entry of the observation is ``value``."""
+
+    def __init__(self, value):
+        super().__init__(gymnasium.make("CartPole-v1"))
+        self.value, self.steps = value, 0
+
+    def step(self, action):
+        observation, *rest = self.env.step(action)
+        self.steps += 1
+        if self.steps >= 80:
+            observation[2] = self.value
+        return observation, *rest
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_an_observation_that_is_no_number_is_named(value, tmp_path):
+    """An infinity is clipped on its way to the loss, and would spoil the running statistics."""
+    env = GymVectorEnv(lambda: BadSensor(value), SMALL.num_envs, seed=0, max_episode_steps=500)
+    agent = make_agent(env, SMALL, 0)
+    with (
+        Run.open(tmp_path, {}, recipe="x") as run,
+        pytest.raises(RunError, match=rf"observation is {value} at \[0, \d+, 2\] of the batch at"),
+    ):
+        train_ppo(env, agent, Breaks(1.0), SMALL, steps=64 * 4, seed=0, run=run)
+    assert env.is_closed
+    assert agent.normaliser.mean.isfinite().all()
 
 
 @pytest.mark.parametrize(
@@ -155,13 +191,17 @@ def test_a_discriminator_that_leaves_the_numbers(nursery, tmp_path):
     assert not list((tmp_path / "gail").glob("*.safetensors"))
 
 
+def reward_of(env):
+    return GenerativeReward.for_vectors(4, env.action_spec, hidden=[8], normalise="raw")
+
+
 def test_fits_that_leave_the_numbers(tmp_path):
     env = make_env(TASK, 1, 0)
     played = record_demonstration(
         gym_factory(TASK), lambda o: o.new_ones(1).long(), seed=0, length=40
     )
     pairs = played.transitions
-    reward = GenerativeReward.for_vectors(4, env.action_spec, hidden=[8], normalise="raw")
+    reward = reward_of(env)
     with (
         Run.open(tmp_path / "fit", {}, recipe="x") as run,
         pytest.raises(RunError, match=r"fit/fitted/\w+ is (nan|inf) at 10 of 20 fitting steps"),
@@ -169,6 +209,13 @@ def test_fits_that_leave_the_numbers(tmp_path):
         cfg = FitConfig(steps=20, lr=1e30, log_every=10)
         fit_reward(GenerativeRewardLoss(reward), pairs, cfg, seed=0, run=run)
     agent = make_agent(env, SMALL, 0)
+    bad = pairs.clone()
+    bad["next", "observation"][7, 3] = float("nan")
+    with (
+        Run.open(tmp_path / "bad", {}, recipe="x") as run,
+        pytest.raises(RunError, match=r"next observation is nan at \[7, 3\] of the batch, so that"),
+    ):
+        fit_reward(GenerativeRewardLoss(reward_of(env)), bad, FitConfig(steps=20), seed=0, run=run)
     with (
         Run.open(tmp_path / "bc", {}, recipe="x") as run,
         pytest.raises(RunError, match=r"bc/fitted/loss is (nan|inf) at 10 of 20 gradient steps"),
@@ -235,11 +282,11 @@ def test_runs_save_and_stop_when_their_study_is_killed(tmp_path):
         time.sleep(0.1)
     assert_readable(root)
     (log,) = [
-        text for path in root.rglob("*.log") if "interrupted at" in (text := path.read_text())
+        text for path in root.rglob("*.log") if "interrupted in" in (text := path.read_text())
     ]
     assert "the study's process is gone" in log
     assert "1,280,000 steps: the same command continues from there." in log
-    taken = int(re.search(r"interrupted at ([\d,]+) of", log)[1].replace(",", ""))
+    taken = int(re.search(r"interrupted in .+ at ([\d,]+) of", log)[1].replace(",", ""))
     (folder,) = [path.parent for path in root.rglob("ppo.safetensors") if "seed0" in str(path)]
     assert load_state(folder / "ppo.safetensors")["steps"] == taken > 0
 

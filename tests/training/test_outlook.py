@@ -1,0 +1,30 @@
+"""What a run says of its length before it begins."""
+
+from giril_rl.configs import DemoConfig, ExpertConfig, FitConfig, RunConfig, TaskConfig
+from giril_rl.training.outlook import announce, outlook
+
+BREAKOUT = TaskConfig(name="breakout", env_id="ALE/Breakout-v5", expert_steps=9_000_000)
+POLE = TaskConfig(name="pole", env_id="CartPole-v1", expert_steps=180_000)
+
+
+def test_a_player_is_announced_only_where_one_is_trained():
+    cfg = RunConfig(task=BREAKOUT, steps=36_000_000)
+    cfg.fit = FitConfig(steps=43_200)  # 43,200 / 12 a second is an hour.
+    parts = "reward model: 43,200 steps, about 60 min; policy: 36,000,000 steps, about 20.0 h"
+    sentence = outlook(cfg, ExpertConfig(), DemoConfig(), has_player=False)
+    assert sentence.startswith(f"player: at most 9,000,000 steps, about 5.0 h; {parts} (")
+    for expert, demo, has_player in (
+        (ExpertConfig(), DemoConfig(), True),
+        (ExpertConfig(path="player"), DemoConfig(), False),
+        (ExpertConfig(), DemoConfig(path="shipped"), False),
+    ):
+        assert outlook(cfg, expert, demo, has_player=has_player).startswith(f"{parts} (")
+
+
+def test_what_is_short_begins_without_a_word(capsys):
+    announce(RunConfig(task=POLE, steps=180_000), ExpertConfig(), DemoConfig(), has_player=False)
+    assert capsys.readouterr().err == ""
+    announce(RunConfig(task=POLE, steps=720_000), ExpertConfig(), DemoConfig(), has_player=False)
+    assert "player: at most 180,000 steps, about 30 s; policy: 720,000 steps, about 2 min" in (
+        capsys.readouterr().err
+    )
