@@ -18,6 +18,7 @@ from giril_rl.networks.agents import agent_for
 from giril_rl.rewards import GenerativeReward
 from giril_rl.rewards import fit as whole_fit
 
+BALL = Path(__file__).parents[1] / "docs/tutorials/giril_on_your_environment.py"
 GENERATED = {"docs/results/pybullet/report.md"}
 CARTPOLE = TaskConfig(name="cartpole", env_id="CartPole-v1")
 PENDULUM = TaskConfig(name="pendulum", env_id="Pendulum-v1")
@@ -91,6 +92,14 @@ def reuse_after(names):
     names["collect"](TensorDictModule(nn.Linear(3, 1), ["observation"], ["action"]))
 
 
+def extending(*_):
+    """The module that registers the page's environment, and a demonstration of it."""
+    text = BALL.read_text("utf-8")
+    Path("my_envs.py").write_text(text.replace("BallOnBeam-v0", "Ball-v0"))
+    tutorial().play(Path("mine.npz"), episodes=1)
+    Path("runs/giril/my_envs-Ball-v0/default/seed0").mkdir(parents=True)
+
+
 def extending_after(names):
     batch = TensorDict({"observation": torch.zeros(4, 2)}, [4])
     batch["next"] = TensorDict({"observation": torch.ones(4, 2), "reward": torch.zeros(4, 1)}, [4])
@@ -129,15 +138,19 @@ def demonstrations_after(_):
     assert Path("breakout.gif").is_file() and Path("again.npz").is_file()
 
 
+def tutorial():
+    """The tutorial's module, under a name of no importance."""
+    spec = importlib.util.spec_from_file_location("ball", BALL)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
 def ball(*_):
     """What the script leaves in the folder, and the run."""
-    path = Path(__file__).parents[1] / "docs/tutorials/giril_on_your_environment.py"
-    spec = importlib.util.spec_from_file_location("ball", path)
-    tutorial = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(tutorial)
-    Path("ball").mkdir()
-    tutorial.play(Path("ball/ball.npz"), episodes=1)
-    Path("runs/ball").mkdir(parents=True)
+    for folder in ("ball", "runs/ball"):
+        Path(folder).mkdir(parents=True)
+    tutorial().play(Path("ball/ball.npz"), episodes=1)
 
 
 def ball_after(_):
@@ -156,6 +169,6 @@ OF = {
     "docs/sharing.md": (sharing, nothing),
     "docs/studies.md": (study_of("my_study.yaml"), nothing),
     "docs/reuse.md": (nothing, reuse_after),
-    "docs/extending.md": (nothing, extending_after),
+    "docs/extending.md": (extending, extending_after),
     "docs/demonstrations.md": (demonstrations, demonstrations_after),
 }

@@ -100,10 +100,12 @@ class Parsed(BaseException):
 def understood(line, monkeypatch):
     """Parses a command of which only the words are known."""
 
-    def parse(parser, argv):
-        raise Parsed(argparse.ArgumentParser.parse_args(parser, argv))
+    for name in ("parse_args", "parse_intermixed_args"):
 
-    monkeypatch.setattr(Parser, "parse_args", parse)
+        def parse(parser, argv, name=name):
+            raise Parsed(getattr(argparse.ArgumentParser, name)(parser, argv))
+
+        monkeypatch.setattr(Parser, name, parse)
     with pytest.raises((Parsed, SystemExit)):  # The latter after --help.
         main(shlex.split(line)[1:])
     monkeypatch.undo()
@@ -175,7 +177,7 @@ def test_all_that_a_page_shows_holds(name, dry, monkeypatch, capsys):
 def check_inline(text, capsys):
     for line in inline(text):
         words = line.split()
-        if words[1] in ("demo", "eval", "report", "ls"):
+        if words[1] in ("demo", "eval", "report", "ls") or words[2] == "-m":
             with pytest.MonkeyPatch.context() as patch:
                 understood(line, patch)
         elif words[1] == "cp" or not words[2].endswith((".py", ".yaml")):  # Files of the reader's.
