@@ -18,6 +18,7 @@ from typing import Any
 from giril_rl import recipes
 from giril_rl.allocator import keep_freed_memory
 from giril_rl.cli_parser import Parser as _Parser
+from giril_rl.cli_parser import check_number
 from giril_rl.errors import FAILED, INTERRUPTED, RunError, UserError, told
 from giril_rl.nearest import did_you_mean
 from giril_rl.places import check_place
@@ -77,37 +78,58 @@ def _run(argv: Sequence[str]) -> int:
         return 0
 
     from giril_rl.compose import resolved
-    from giril_rl.naming import out_folder
+    from giril_rl.imports import import_modules, modules_of
+    from giril_rl.jobs import Job, Jobs
+    from giril_rl.naming import is_scored_as, out_folder
     from giril_rl.overrides import sweep
+    from giril_rl.sources import check_sources, making, sources
+    from giril_rl.validation import notices
 
-    jobs: dict[Path, list[str]] = {}
+    composing = Jobs()
+    jobs: dict[Path, tuple[Job, list[str]]] = {}
     # All jobs are composed and checked first: a bad value in the last one stops the sweep at once.
-    for job in sweep(texts) if args.multirun else [texts]:
-        config, changes = resolved(recipe, schema, job)
-        out = out_folder(recipe.name, config, changes)
+    for words in sweep(texts) if args.multirun else [texts]:
+        job = composing.job(recipe, schema, words)
+        out = out_folder(recipe.name, job.config, job.changes)
         if out in jobs:
             raise UserError(
-                f"two jobs would share the folder {out}: leave out= to giril, or vary it."
+                f"two jobs are the same run, {out}: leave one of them out."
+                if job.config.out is None
+                else f"two jobs would share the folder {out}: leave out= to giril, or vary it."
             )
         check_place(out, "out=")
-        if _makes_things_below_root(config):
-            check_place(Path(config.root), "root=")
-        jobs[out] = job
+        if _makes_things_below_root(job.config):
+            check_place(Path(job.config.root), "root=")
+        jobs[out] = job, words
+    for out, (job, _) in jobs.items():
+        import_modules(modules_of(job.config), *recipe.folders)
+        check_sources(out, sources(recipe, modules_of(job.config)))
     keep_freed_memory()
     module = recipe.load()
 
     def run(out: Path) -> None:
-        config, _ = resolved(recipe, module.Config, jobs[out])
+        config, _ = resolved(recipe, module.Config, jobs[out][1])
+        for sentence in notices(config):
+            print(f"giril: {sentence}", file=sys.stderr)
         if "torch" in sys.modules:  # As with every recipe that trains something.
             sys.modules["torch"].set_num_threads(config.threads)
-        module.main(config, out)
+        finished = (out / "result.json").exists()
+        with making(out, sources(recipe, modules_of(config))):
+            module.main(config, out)
+        if finished and is_scored_as(out, config.eval):
+            print(f"giril: {out} was finished earlier: nothing was run.", file=sys.stderr)
+        elif finished:
+            from giril_rl.training.finished import score_anew
+
+            score_anew(out, config.eval)
         if (out / "result.json").exists():
             from giril_rl.training.finished import print_scores
 
             print_scores(out)
 
     if args.multirun:
-        return _run_all(run, {out: " ".join([recipe.word, *job]) for out, job in jobs.items()})
+        titles = {out: " ".join([recipe.word, *words]) for out, (_, words) in jobs.items()}
+        return _run_all(run, titles)
     for out in jobs:
         run(out)
     return 0
@@ -140,13 +162,15 @@ def _eval(argv: Sequence[str]) -> int:
     parser.add_argument("run", metavar="RUN", type=Path, help="the folder of a run")
     parser.add_argument("--episodes", type=int, metavar="N", help="whole episodes to play")
     parser.add_argument("--seed", type=int, metavar="S", help="seed of the episodes")
+    parser.add_imports()
     args = parser.parse_args(argv)
     if not args.run.is_dir():
         raise UserError(f"there is no run folder {args.run}.")
-    if args.episodes is not None and args.episodes < 1:
-        raise UserError(f"--episodes {args.episodes}: at least 1 is needed.")
-    if args.seed is not None and args.seed < 0:
-        raise UserError(f"--seed {args.seed}: at least 0 is needed.")
+    check_number("--episodes", args.episodes, least=1)
+    check_number("--seed", args.seed, least=0)
+    from giril_rl.imports import import_modules
+
+    import_modules(args.imports, Path.cwd())
     from giril_rl.training.finished import evaluate_run
 
     evaluate_run(args.run, args.episodes, args.seed)
@@ -199,7 +223,7 @@ _COMMANDS: dict[str, tuple[Callable[[Sequence[str]], int], str]] = {
     "ls": (_ls, "giril ls"),
     "cp": (_cp, "giril cp RECIPE FILE"),
     "run": (_run, "giril run RECIPE [key=value ...] [-m] [--help]"),
-    "eval": (_eval, "giril eval RUN [--episodes N] [--seed S]"),
+    "eval": (_eval, "giril eval RUN [--episodes N] [--seed S] [--import MODULE]"),
     "demo": (_demo, "giril demo show|import|export|play ... [--help]"),
     "study": (_study, "giril study STUDY [key=value ...] [--dry-run]"),
     "report": (_report, "giril report DIR [--out FOLDER]"),

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from giril_rl.cli_parser import Parser
+from giril_rl.cli_parser import Parser, check_number
 from giril_rl.errors import UserError
 
 FASTEST = 50
@@ -50,7 +50,17 @@ def _add(kinds: Any, name: str, run: Any) -> Parser:
 
 def _add_task(parser: Parser) -> None:
     parser.add_argument("--task", metavar="TASK", help="a task's name, as in task=breakout")
-    parser.add_argument("--env-id", metavar="ID", help="or a Gymnasium id, as in Pendulum-v1")
+    parser.add_argument(
+        "--env-id", metavar="ID", help="or a Gymnasium id, as in Pendulum-v1 or my_envs:Ball-v0"
+    )
+    parser.add_imports()
+
+
+def _import_modules(args: Namespace) -> None:
+    """Those that the command line names; what a demonstration's card names is not imported."""
+    from giril_rl.imports import import_modules, named_modules
+
+    import_modules([*args.imports, *named_modules(args.env_id)], Path.cwd())
 
 
 def _show(kinds: Any) -> None:
@@ -120,6 +130,8 @@ def _run_show(args: Namespace) -> None:
 def _run_import(args: Namespace) -> None:
     """Make a demonstration of a data set, checked against its task."""
     _check_new(args.out)
+    check_number("--episodes", args.episodes, least=1)
+    _import_modules(args)
     from giril_rl.demos.importing import import_demonstration
     from giril_rl.demos.task import named_task
 
@@ -140,6 +152,7 @@ def _run_export(args: Namespace) -> None:
         to_npz(found, args.npz)
         print(f"{args.npz} has {len(found):,} transitions, {found.num_episodes:,} episodes.")
         return
+    _import_modules(args)
     from giril_rl.demos.task import as_recorded_task, named_task
     from giril_rl.envs import gym_factory
 
@@ -159,9 +172,9 @@ def _run_export(args: Namespace) -> None:
 def _run_play(args: Namespace) -> None:
     """Play an Atari game by hand, and record it."""
     _check_new(args.out)
-    for name, least in (("episodes", 1), ("seed", 0)):
-        if getattr(args, name) < least:
-            raise UserError(f"--{name} {getattr(args, name)}: at least {least} is needed.")
+    check_number("--episodes", args.episodes, least=1)
+    check_number("--seed", args.seed, least=0)
+    _import_modules(args)
     from giril_rl.demos.play import Window, play_demonstration
     from giril_rl.demos.task import as_recorded_task, named_task
     from giril_rl.envs import gym_factory

@@ -54,6 +54,10 @@ class Composed:
         """Dotted keys that somebody chose, who then wins over the kind of task."""
         return self.written | self.changes.keys()
 
+    def missing(self) -> list[str]:
+        """Dotted keys of mandatory values that nobody has given."""
+        return list(_missing(OmegaConf.to_container(self.node, resolve=False)))
+
     def config(self) -> Any:
         """The instance of ``Config`` with every interpolation resolved, for its kind of task.
 

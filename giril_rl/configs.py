@@ -13,6 +13,9 @@ from typing import Any
 
 from omegaconf import MISSING
 
+MOST = 2**63 - 1
+"""The largest whole number of any knob: what torch takes for a seed or a size, and files keep."""
+MOST_THREADS = 1024
 COMPILE = "torch.compile of gradient steps: for long training on frames, 20 seconds to begin"
 
 
@@ -58,6 +61,17 @@ def knob(
     return field(default=default, metadata=metadata)
 
 
+def split_id(env_id: str) -> tuple[str | None, str]:
+    """The module that registers an id, where it is named as Gymnasium has it, and the id proper.
+
+    Examples:
+        >>> split_id("my_envs:Ball-v0"), split_id("Pendulum-v1")
+        (('my_envs', 'Ball-v0'), (None, 'Pendulum-v1'))
+    """
+    module, colon, name = env_id.rpartition(":")
+    return (module if colon else None), name
+
+
 def is_atari(env_id: str) -> bool:
     """Whether a Gymnasium id is one of the Arcade Learning Environment.
 
@@ -65,7 +79,7 @@ def is_atari(env_id: str) -> bool:
         >>> is_atari("ALE/Pong-v5"), is_atari("Pendulum-v1")
         (True, False)
     """
-    return env_id.startswith("ALE/")
+    return split_id(env_id)[1].startswith("ALE/")
 
 
 @dataclass
@@ -73,7 +87,11 @@ class TaskConfig:
     """The environment and what is known about it."""
 
     name: str = knob(MISSING, "name of the task, used for folders and tables")
-    env_id: str = knob(MISSING, "Gymnasium id; vector observation or ALE/..., Box or Discrete")
+    env_id: str = knob(
+        MISSING,
+        "Gymnasium id, or MODULE:ID of a module of yours; vector observation or ALE/..., Box or "
+        "Discrete",
+    )
     max_episode_steps: int | None = knob(
         None, "time limit; null takes the one registered for the id (Atari: 27,000)", low=1
     )
@@ -131,6 +149,16 @@ class PPOConfig:
     checkpoint_every: int = knob(100_000, "environment steps between checkpoints", low=1)
     compile: bool = knob(False, f"{COMPILE}; of the acting policy as well")
 
+    def whole_batches(self, steps: int) -> int:
+        """``steps``, rounded up to the end of a batch.
+
+        Examples:
+            >>> PPOConfig(num_envs=16, rollout=125).whole_batches(15_000)
+            16000
+        """
+        batch = self.num_envs * self.rollout
+        return -(-steps // batch) * batch
+
 
 @dataclass
 class ExpertConfig:
@@ -155,7 +183,7 @@ class DemoConfig:
     path: str | None = knob(
         None,
         "folder of a demonstration to use; `shipped` takes the package's own, the one of the run's "
-        "seed, `shipped:NAME/2` a given one; null records one; default: task.demonstration",
+        "seed, `shipped:NAME/2` a given one; null records one; the task decides by default",
     )
     length: int | None = knob(
         1000, "transitions to record; null records `episodes` whole episodes", low=1
@@ -288,7 +316,12 @@ class BCConfig:
     lr: float = knob(3e-3, "AdamW step size, decreasing linearly to zero", low=0, low_open=True)
     weight_decay: float = knob(1.0, "AdamW's weight decay, times the step size", low=0)
     min_scale: float = knob(0.07, "smallest deviation that observations are divided by", low=0)
-    min_std: float = knob(0.01, "Box: smallest deviation of sampled actions", low=0, low_open=True)
+    min_std: float = knob(
+        0.01,
+        "Box: smallest deviation of sampled actions, in units of half their range",
+        low=0,
+        low_open=True,
+    )
     log_every: int = knob(
         100, "gradient steps between logged losses, where held-out ones are compared", low=1
     )
@@ -334,12 +367,17 @@ class RunConfig:
         None, "the run's folder; null makes a name from recipe, task and changes"
     )
     root: str = knob("runs", "where runs, experts and demonstrations are kept")
+    imports: list[str] = knob(
+        [], "modules of yours that register environments; found here and beside the recipe"
+    )
     logger: str | None = knob(
         "tensorboard",
         "where curves go besides the run's own files; null nowhere",
         choices=("tensorboard", "csv", "wandb", "mlflow"),
     )
-    threads: int = knob(1, "torch threads; small networks are fastest with 1", low=1)
+    threads: int = knob(
+        1, "torch threads; small networks are fastest with 1", low=1, high=MOST_THREADS
+    )
     device: str = knob(
         "cpu",
         "where networks and batches are; environments stay on the CPU",
@@ -367,7 +405,7 @@ class UnaveragedRunConfig(RunConfig):
 
 
 @dataclass
-class ExpertRunConfig(RunConfig):
+class ExpertRunConfig(UnaveragedRunConfig):
     """What the expert's own recipe takes: PPO on the true reward."""
 
     steps: int = knob(5_000_000, "most environment steps of expert training (paper: 5M)", low=1)
@@ -396,6 +434,7 @@ class ControlRunConfig(RunConfig):
             "held_action",
         ),
     )
+    held_episodes: int = knob(20, "held_action: episodes that choose the action", low=1)
     expert: ExpertConfig = field(default_factory=ExpertConfig)
     demo: DemoConfig = field(default_factory=DemoConfig)
     giril: GenerativeConfig = field(default_factory=GenerativeConfig)

@@ -10,26 +10,25 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from giril_rl.configs import ExpertRunConfig
+from giril_rl.configs import EvalConfig, ExpertRunConfig
+from giril_rl.files import read_json
 
 _OWN_PLACE = {"task", "task.name", "seed"}
 NO_EFFECT = frozenset(
     {
-        "out",
-        "root",
-        "logger",
-        "threads",
-        "device",
-        "ppo.compile",
-        "fit.compile",
-        "reward.compile",
+        *("out", "root", "imports", "logger", "threads", "device"),
+        *("ppo.compile", "fit.compile", "reward.compile"),
+        *("ppo.checkpoint_every", "fit.log_every"),
+        *("eval.episodes", "eval.seed"),
         "task.demonstration",  # It acts through demo.path.
     }
 )
-"""Keys that change where and how fast a run is made, and not what it is a run of.
+"""Keys that change where, how fast and how closely watched a run is made, and not what it is a run
+of.
 
 On another device, or compiled, rounding differs and random numbers are others, of the same
-distribution.
+distribution. A policy may be scored again in any other way, see
+:func:`giril_rl.training.finished.score_anew`.
 """
 EDITION = 2
 """Counts up where the same settings give other numbers than before; part of every hash."""
@@ -43,6 +42,7 @@ ADDED = {
     "ppo.clip_value": False,
     "demo.lives": "first",
     "clip_reward": False,
+    "held_episodes": 20,
 }
 """Keys that earlier runs did not have, with the value that they behaved by."""
 
@@ -165,3 +165,16 @@ def out_folder(recipe: str, config: Any, changes: Mapping[str, str]) -> Path:
     named = frozenset({"task.env_id"} if config.task.name == config.task.env_id else ())
     place = Path(config.root) / safe(recipe) / safe(config.task.name)
     return place / variant(changes, named) / f"seed{config.seed}"
+
+
+def is_scored_as(folder: Path, settings: EvalConfig) -> bool:
+    """Whether a finished run's scores are of the episodes that ``settings`` ask for.
+
+    Where its ``result.json`` does not say, they are.
+    """
+    result = read_json(folder / "result.json")
+    seeds = result.get("seeds")
+    seed = seeds.get("evaluation", settings.seed) if isinstance(seeds, dict) else settings.seed
+    return bool(
+        result.get("episodes", settings.episodes) == settings.episodes and seed == settings.seed
+    )

@@ -13,7 +13,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from giril_rl.errors import UserError
 from giril_rl.nearest import did_you_mean
-from giril_rl.schema import Leaf, leaves
+from giril_rl.schema import Leaf, flat, leaves
 
 
 def parse(texts: Sequence[str]) -> list[Override]:
@@ -36,7 +36,7 @@ def parse(texts: Sequence[str]) -> list[Override]:
             raise UserError(f"{text!r} is not of the form key=value.")
         try:
             (override,) = OverridesParser.create().parse_overrides([text])
-        except OverrideParseException:
+        except (OverrideParseException, ValueError):  # The latter of thousands of digits.
             raise UserError(
                 f"{text}: the value cannot be read; put text with special characters in quotes, "
                 f"such as {key}=\"'{value}'\"."
@@ -50,6 +50,32 @@ def parse(texts: Sequence[str]) -> list[Override]:
 def normalised(override: Override) -> str:
     """The override as text in one spelling: ``1e-3`` and ``0.001`` are the same change."""
     return f"{override.get_key_element()}={override.get_value_element_as_str()}"
+
+
+def leaf_words(texts: Sequence[str]) -> dict[str, str]:
+    """``key=value`` texts by key, a mapping as one text for each of its entries.
+
+    Raises:
+        UserError: as :func:`parse`, and for a key that is given twice.
+
+    Examples:
+        >>> leaf_words(["seed=3", "ppo={lr:1e-3,hidden:[8,8]}"])
+        {'seed': 'seed=3', 'ppo.lr': 'ppo.lr=0.001', 'ppo.hidden': 'ppo.hidden=[8,8]'}
+    """
+    words: dict[str, str] = {}
+    for override, text in zip(parse(texts), texts, strict=True):
+        key, value = override.get_key_element(), override._value
+        entries = {key: text}
+        if isinstance(value, dict):
+            entries = {
+                name: f"{name}={Override._get_value_element_as_str(entry)}"
+                for name, entry in flat({key: value}).items()
+            }
+        for name, word in entries.items():
+            if name in words:
+                raise UserError(f"{name} is given twice: give it once.")
+            words[name] = word
+    return words
 
 
 class KeyCheck:
@@ -102,7 +128,7 @@ class KeyCheck:
             raise UserError(f"{where}{key!r} is not a key of {self.recipe}{hint}")
         try:
             OmegaConf.update(self._scratch, key, value, merge=False)
-        except OmegaConfBaseException:
+        except (OmegaConfBaseException, OverflowError):
             leaf = self.leaves[key]
             hint = f", such as {int(value)}" if _is_whole(value) and "whole" in leaf.needed else ""
             raise UserError(f"{where}{text}: {leaf.needed} is needed{hint}.") from None

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import functools
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
 from typing import Any, Self
 
 import torch
 from torch import nn
-from torchrl.data import Bounded, Categorical, OneHot, TensorSpec, Unbounded
+from torchrl.data import Bounded, Categorical, OneHot, TensorSpec
 
 from giril_rl.errors import UserError
 from giril_rl.files import installed_versions, read_json, remove_leftovers, write_json
 from giril_rl.formats import check_format
+from giril_rl.networks.action_bounds import single_action_spec
 
 FORMAT_VERSION = 1
 WEIGHTS = "model.safetensors"
@@ -67,6 +68,12 @@ class Pretrained:
     """
 
     _made_by: tuple[str, dict[str, Any]] | None = None
+    readable_formats: Collection[int] = (FORMAT_VERSION,)
+
+    @property
+    def card_format(self) -> int:
+        """The format of this module's card; a card of an older one means another module."""
+        return FORMAT_VERSION
 
     @property
     def made_with(self) -> dict[str, Any]:
@@ -104,7 +111,7 @@ class Pretrained:
             "constructor": self._made_by[0],
             "arguments": self.made_with,
         }
-        about = {"format_version": FORMAT_VERSION, "made_by": made_by, **(card or {})}
+        about = {"format_version": self.card_format, "made_by": made_by, **(card or {})}
         write_json(folder / CARD, {"versions": installed_versions(), **about})
         return folder
 
@@ -139,9 +146,10 @@ class Pretrained:
     @classmethod
     def _remade(cls, path: Path, device: str) -> Any:
         card = read_json(path)
+        written = card.get("format_version")
         check_format(
-            card.get("format_version"),
-            [FORMAT_VERSION],
+            written,
+            cls.readable_formats,
             where=f"{path} has format",
             older="load it with the version that wrote it and save its module anew",
         )
@@ -156,12 +164,18 @@ class Pretrained:
         try:
             arguments = {key: _spoken(value) for key, value in made_by["arguments"].items()}
             with torch.device(device):
-                return constructor(**arguments)
+                made = constructor(**arguments)
         except Exception as error:  # Arguments of any kind and size raise nearly anything.
             reason = " ".join(str(error).split())[:200]
             raise UserError(
                 f"{path} says of its {cls.__name__} what cannot be made ({reason}): restore a copy."
             ) from None
+        if written < made.card_format:
+            raise UserError(
+                f"{path} has format {written}, of a policy or reward that this giril_rl would run "
+                "otherwise than it was trained: train it anew, or use the version that wrote it."
+            )
+        return made
 
 
 def _shapes(state: Mapping[str, Any]) -> dict[str, Any]:
@@ -185,20 +199,23 @@ def plain(value: Any) -> Any:
         >>> plain(Categorical(3, shape=(16,))), plain(("next", "observation"))
         ({'action_spec': 'discrete', 'n': 3}, ['next', 'observation'])
     """
-    if isinstance(value, (Categorical, OneHot)):
-        kind = "one_hot" if isinstance(value, OneHot) else "discrete"
-        return {"action_spec": kind, "n": int(value.space.n)}
-    if isinstance(value, (Bounded, Unbounded)):
-        low, high = (
-            bound.reshape(-1, value.shape[-1])[0].tolist()
-            for bound in (value.space.low, value.space.high)
-        )
-        return {"action_spec": "box", "low": low, "high": high}
     if isinstance(value, TensorSpec):
-        raise UserError(f"a card cannot describe an action spec of the kind {type(value)}.")
+        return _plain_spec(single_action_spec(value))
     if isinstance(value, (list, tuple)):
         return [plain(entry) for entry in value]
     return value
+
+
+def _plain_spec(value: TensorSpec) -> dict[str, Any]:
+    if isinstance(value, (Categorical, OneHot)):
+        kind = "one_hot" if isinstance(value, OneHot) else "discrete"
+        return {"action_spec": kind, "n": int(value.space.n)}
+    limit = torch.finfo(torch.float32).max  # JSON has no infinity.
+    low, high = (
+        bound.reshape(-1, value.shape[-1])[0].float().clamp(-limit, limit).tolist()
+        for bound in (value.space.low, value.space.high)
+    )
+    return {"action_spec": "box", "low": low, "high": high}
 
 
 def _spoken(value: Any) -> Any:

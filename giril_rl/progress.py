@@ -23,6 +23,7 @@ class progress:
         unit: what a step is called.
         interval: seconds between lines without a terminal.
         stream: where to write; None takes ``sys.stderr``.
+        disable: write nothing and only count.
 
     Examples:
         >>> import io
@@ -42,6 +43,7 @@ class progress:
         unit: str = "steps",
         interval: float = 30.0,
         stream: TextIO | None = None,
+        disable: bool = False,
     ) -> None:
         self.total, self.initial, self.done = total, initial, initial
         self.desc, self.unit, self.interval = desc, f" {unit}", interval
@@ -50,8 +52,9 @@ class progress:
         self._began = self._written = time.monotonic()
         self._last_done = initial
         self._lines = 0
+        self._disable = disable
         self._bar: tqdm | None = None
-        if self.stream.isatty():
+        if self.stream.isatty() and not disable:
             self._bar = tqdm(
                 total=total,
                 initial=initial,
@@ -69,7 +72,7 @@ class progress:
             if values:
                 self._bar.set_postfix(self._postfix, refresh=False)
             self._bar.update(steps)
-        elif time.monotonic() - self._written >= self.interval:
+        elif not self._disable and time.monotonic() - self._written >= self.interval:
             self._write_line()
 
     def close(self) -> None:

@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from types import ModuleType
 from typing import Any
 
+from giril_rl.imports import search_in
 from giril_rl.recipes import Recipe
 
 
@@ -32,6 +33,8 @@ def config_class(recipe: Recipe) -> type[Any]:
     sys.modules[module.__name__] = module
     if recipe.docstring:
         body = _needed_for("Config", ast.parse(recipe.path.read_text("utf-8")).body)
+        if not recipe.is_shipped:
+            search_in(*recipe.folders)
         code = compile(ast.Module(body, []), str(recipe.path), "exec", dont_inherit=True)
         try:
             exec(code, module.__dict__)

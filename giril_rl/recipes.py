@@ -19,6 +19,7 @@ from typing import Any
 
 from giril_rl.configs import RunConfig
 from giril_rl.errors import UserError
+from giril_rl.imports import missing, search_in
 from giril_rl.nearest import did_you_mean
 
 
@@ -54,6 +55,17 @@ class Recipe:
         return self.path.stem
 
     @property
+    def is_shipped(self) -> bool:
+        """Whether it is the package's own rather than a copy."""
+        return self.path.parent == shipped_folder()
+
+    @property
+    def folders(self) -> list[Path]:
+        """Where modules of the user's own are looked for, besides installed packages."""
+        here = [Path.cwd()]
+        return here if self.is_shipped else list(dict.fromkeys([self.path.parent, *here]))
+
+    @property
     def docstring(self) -> str:
         """The file's docstring, read without running the file; empty where there is none."""
         try:
@@ -66,7 +78,12 @@ class Recipe:
             raise UserError(f"{self.path} is not Python as UTF-8 text ({error}).") from error
 
     def load(self) -> ModuleType:
-        """Run the recipe's file as a module and check that it has ``Config`` and ``main``."""
+        """Run the recipe's file as a module and check that it has ``Config`` and ``main``.
+
+        Raises:
+            UserError: where it has not, or imports a module that is not there.
+        """
+        self._check_name()
         name = f"giril_recipe_{self.name}"
         spec = importlib.util.spec_from_file_location(name, self.path)
         if not self.docstring or spec is None or spec.loader is None:
@@ -76,11 +93,30 @@ class Recipe:
         module = importlib.util.module_from_spec(spec)
         # Dataclasses look up their module by name when their annotations are read.
         sys.modules[name] = module
-        spec.loader.exec_module(module)
+        if not self.is_shipped:
+            search_in(*self.folders)
+        try:
+            spec.loader.exec_module(module)
+        except ModuleNotFoundError as error:
+            raise missing(str(self.path), error, *self.folders) from error
         self.check_config(getattr(module, "Config", None))
         if not callable(getattr(module, "main", None)):
             raise UserError(f"{self.path} has no `main(cfg, out)`.")
         return module
+
+    def _check_name(self) -> None:
+        """Refuse a file, such as an early copy, whose runs would be called as another recipe's."""
+        tree = ast.parse(self.path.read_text("utf-8") if self.docstring else "")
+        for node in ast.walk(tree):
+            if not isinstance(node, ast.Call) or not isinstance(node.func, ast.Attribute):
+                continue
+            words = {word.arg: word.value for word in node.keywords}
+            name = words.get("recipe") if node.func.attr == "open" else None
+            if isinstance(name, ast.Constant) and name.value != self.name:
+                raise UserError(
+                    f"{self.path}, line {name.lineno}: its runs would be called {name.value!r}, "
+                    f"not {self.name!r} as the file: write recipe=Path(__file__).stem."
+                )
 
     def check_config(self, config: Any) -> type[Any]:
         """``config`` itself, refused unless it is a dataclass of RunConfig."""
@@ -110,7 +146,8 @@ def find(text: str) -> Recipe:
         text: a name such as ``giril`` or a path that ends in ``.py``.
 
     Raises:
-        UserError: for an unknown name, a missing file, or a file without its YAML.
+        UserError: for an unknown name, a missing file, a file without its YAML, or one with the
+            name of a shipped recipe.
 
     Examples:
         >>> find("girl")
@@ -118,6 +155,7 @@ def find(text: str) -> Recipe:
         ...
         giril_rl.errors.UserError: 'girl' is not a recipe; did you mean 'giril'?
     """
+    by_name = {recipe.name: recipe for recipe in shipped()}
     if text.endswith(".py"):
         path = Path(text)
         if not path.is_file():
@@ -125,8 +163,14 @@ def find(text: str) -> Recipe:
         settings = path.with_suffix(".yaml")
         if not settings.is_file():
             raise UserError(f"{text} needs its settings in {settings}: `giril cp` copies both.")
-        return Recipe(text, path.resolve(), settings.resolve())
-    by_name = {recipe.name: recipe for recipe in shipped()}
+        found = Recipe(text, path.resolve(), settings.resolve())
+        own = by_name.get(found.name.partition(":")[0])
+        if own is not None and own.path.resolve() != found.path:
+            raise UserError(
+                f"{text} has the name of the recipe {own.name}, whose runs its own would be "
+                "taken for: rename both files."
+            )
+        return found
     if text not in by_name:
         hint = did_you_mean(text, by_name) or f": choose one of {', '.join(by_name)}."
         raise UserError(f"{text!r} is not a recipe{hint}")

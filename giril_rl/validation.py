@@ -8,6 +8,7 @@ from dataclasses import fields, is_dataclass
 from typing import Any
 
 from giril_rl.configs import (
+    MOST,
     BCConfig,
     DemoConfig,
     ExpertConfig,
@@ -17,6 +18,7 @@ from giril_rl.configs import (
     TaskConfig,
 )
 from giril_rl.errors import UserError
+from giril_rl.imports import check_names
 from giril_rl.schema import leaves
 from giril_rl.task_defaults import apply_task_defaults
 
@@ -49,17 +51,6 @@ def _check_ppo(key: str, ppo: PPOConfig) -> None:
         raise UserError(
             f"{key}.minibatch={ppo.minibatch} does not divide {key}.num_envs * {key}.rollout "
             f"= {ppo.num_envs} * {ppo.rollout} = {batch}: choose one that does."
-        )
-
-
-def _check_steps(key: str, steps: int, ppo: PPOConfig) -> None:
-    batch = ppo.num_envs * ppo.rollout
-    if steps % batch:
-        lower = steps // batch * batch
-        near = f"{lower} or {lower + batch}" if lower else str(batch)
-        raise UserError(
-            f"{key}={steps} is no whole number of batches of {ppo.num_envs} * {ppo.rollout} = "
-            f"{batch} steps (ppo.num_envs * ppo.rollout): give {near}."
         )
 
 
@@ -135,6 +126,7 @@ def _check_layers(config: RunConfig) -> None:
 
 def _check_run(config: Any) -> None:
     if isinstance(config, RunConfig):
+        check_names(config.imports)
         _check_normalise(config)
         if config.task.is_atari:
             _check_layers(config)
@@ -143,14 +135,6 @@ def _check_run(config: Any) -> None:
     cloning = getattr(config, "bc", None)
     if isinstance(cloning, BCConfig):
         _check_cloning(config, cloning)
-    elif isinstance(config, RunConfig):
-        _check_steps("steps", config.steps, config.ppo)
-    expert = getattr(config, "expert", None)
-    if isinstance(expert, ExpertConfig) and expert.path is None:
-        # The expert that another recipe trains has the settings of PPO that are the default.
-        key = "task.expert_steps" if expert.steps is None else "expert.steps"
-        ppo = apply_task_defaults(ExpertRunConfig(task=config.task)).ppo
-        _check_steps(key, expert.steps_on(config.task), ppo)
 
 
 def _check_demo(key: str, demo: DemoConfig) -> None:
@@ -215,6 +199,9 @@ def validate(config: Any) -> None:
         for number in value if isinstance(value, list) else [value]:
             if isinstance(number, (str, bool)):
                 continue
+            if isinstance(number, int) and abs(number) > MOST:
+                shown = _show(value) if len(_show(value)) < 100 else "..."
+                raise UserError(f"{leaf.key}={shown}: at most {MOST} is possible.")
             if not math.isfinite(number):
                 raise UserError(f"{leaf.key}={_show(value)}: a finite number is needed.")
             if not _inside(number, leaf.metadata):
@@ -223,3 +210,41 @@ def validate(config: Any) -> None:
                 raise UserError(f"{leaf.key}={_show(value)}{words}.")
     _check_parts(config)
     _check_run(config)
+
+
+def notices(config: Any) -> list[str]:
+    """What a user should know of settings that are taken in another way than they are written.
+
+    Args:
+        config: an instance of a recipe's ``Config``.
+
+    Returns:
+        Sentences.
+
+    Examples:
+        >>> from giril_rl.configs import TaskConfig
+        >>> task = TaskConfig(name="pendulum", env_id="Pendulum-v1")
+        >>> notices(RunConfig(task=task, steps=15_000))
+        ['steps=15000 is no multiple of a batch (16 * 125 = 2,000): 16,000 steps are taken.']
+    """
+    found = []
+    trains = getattr(config, "reward", None) not in ("random", "held_action")
+    if isinstance(config, RunConfig) and trains:  # Of cloning, steps are 0.
+        found += _rounding("steps", config.steps, config.ppo)
+    expert, demo = getattr(config, "expert", None), getattr(config, "demo", None)
+    recorded = not isinstance(demo, DemoConfig) or demo.path is None
+    needed = getattr(config, "needs_demonstration", True)
+    if isinstance(expert, ExpertConfig) and expert.path is None and recorded and needed:
+        # The expert that another recipe trains has the settings of PPO that are the default.
+        key = "task.expert_steps" if expert.steps is None else "expert.steps"
+        ppo = apply_task_defaults(ExpertRunConfig(task=config.task)).ppo
+        found += _rounding(key, expert.steps_on(config.task), ppo)
+    return found
+
+
+def _rounding(key: str, steps: int, ppo: PPOConfig) -> list[str]:
+    taken = ppo.whole_batches(steps)
+    if steps == taken:
+        return []
+    batch = f"{ppo.num_envs} * {ppo.rollout} = {ppo.num_envs * ppo.rollout:,}"
+    return [f"{key}={steps} is no multiple of a batch ({batch}): {taken:,} steps are taken."]

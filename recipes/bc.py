@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
-from giril_rl.configs import BCConfig, DemoConfig, ExpertConfig, RunConfig, knob
+from giril_rl.configs import BCConfig, DemoConfig, ExpertConfig, UnaveragedRunConfig, knob
 from giril_rl.demos import holdout, subsample
 from giril_rl.envs import make_env
 from giril_rl.training import (
@@ -24,7 +24,7 @@ from giril_rl.training import (
 
 
 @dataclass
-class Config(RunConfig):
+class Config(UnaveragedRunConfig):
     """What `giril run bc` takes."""
 
     steps: int = knob(0, "environment steps: cloning takes none", low=0)
@@ -36,7 +36,7 @@ class Config(RunConfig):
 def main(cfg: Config, out: Path) -> None:
     """Train the whole chain and leave its run folder in ``out``."""
     check_inputs(cfg, cfg.expert, cfg.demo)
-    with Run.open(out, asdict(cfg), recipe="bc", logger=cfg.logger) as run:
+    with Run.open(out, asdict(cfg), recipe=Path(__file__).stem, logger=cfg.logger) as run:
         if run.finished:
             return
         demo, expert = obtain_demonstration(cfg, cfg.expert, cfg.demo)
@@ -57,7 +57,6 @@ def main(cfg: Config, out: Path) -> None:
             cfg,
             agent,
             trained,
-            method="bc",
             expert=expert,
             demo=demo,
         )

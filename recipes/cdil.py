@@ -50,7 +50,7 @@ class Config(RunConfig):
 def main(cfg: Config, out: Path) -> None:
     """Train the whole chain and leave its run folder in ``out``."""
     check_inputs(cfg, cfg.expert, cfg.demo)
-    with Run.open(out, asdict(cfg), recipe="cdil", logger=cfg.logger) as run:
+    with Run.open(out, asdict(cfg), recipe=Path(__file__).stem, logger=cfg.logger) as run:
         if run.finished:
             return
         demo, expert = obtain_demonstration(cfg, cfg.expert, cfg.demo)
@@ -89,7 +89,6 @@ def main(cfg: Config, out: Path) -> None:
             cfg,
             agent,
             trained,
-            method="cdil",
             expert=expert,
             demo=demo,
             reward=reward,

@@ -38,7 +38,6 @@ class Config(ControlRunConfig):
 
 def main(cfg: Config, out: Path) -> None:
     """Train a policy on the control reward and leave its run folder in ``out``."""
-    method = f"control:{cfg.reward}"
     if cfg.needs_demonstration:
         check_inputs(cfg, cfg.expert, cfg.demo)
     else:
@@ -48,18 +47,18 @@ def main(cfg: Config, out: Path) -> None:
         player = RandomPolicy.of_task(cfg.task, cfg.seed)
     if cfg.reward == "held_action":
         check_discrete(cfg.task)
-    with Run.open(out, asdict(cfg), recipe="control", logger=cfg.logger) as run:
+    with Run.open(out, asdict(cfg), recipe=Path(__file__).stem, logger=cfg.logger) as run:
         if run.finished:
             return
         if cfg.reward == "held_action":
             # Chosen in episodes of the training's seed, scored in those of the evaluation's.
-            scores = held_action_scores(cfg.task, episodes=cfg.eval.episodes, seed=cfg.seed)
+            scores = held_action_scores(cfg.task, episodes=cfg.held_episodes, seed=cfg.seed)
             run.truncate_metrics("held_action", -1)
             for action, score in enumerate(scores):
                 run.log(action, {"held_action/return_mean": score}, phase="held_action")
             player = HeldAction.of_task(cfg.task, scores.index(max(scores)))
         if player is not None:
-            finish_run(run, cfg, player, Trained(0, 0.0), method=method)
+            finish_run(run, cfg, player, Trained(0, 0.0))
             return
         demo, expert = None, None
         if cfg.needs_demonstration:
@@ -89,7 +88,6 @@ def main(cfg: Config, out: Path) -> None:
             cfg,
             agent,
             trained,
-            method=method,
             expert=expert,
             demo=demo,
             reward=reward,

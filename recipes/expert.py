@@ -16,4 +16,4 @@ class Config(ExpertRunConfig):
 
 def main(cfg: Config, out: Path) -> None:
     """Train an expert and leave its run folder in ``out``."""
-    train_expert(cfg, out)
+    train_expert(cfg, out, recipe=Path(__file__).stem)

@@ -47,7 +47,7 @@ class Config(UnaveragedRunConfig):
 def main(cfg: Config, out: Path) -> None:
     """Train the whole chain and leave its run folder in ``out``."""
     check_inputs(cfg, cfg.expert, cfg.demo)
-    with Run.open(out, asdict(cfg), recipe="vail", logger=cfg.logger) as run:
+    with Run.open(out, asdict(cfg), recipe=Path(__file__).stem, logger=cfg.logger) as run:
         if run.finished:
             return
         demo, expert = obtain_demonstration(cfg, cfg.expert, cfg.demo)
@@ -90,7 +90,6 @@ def main(cfg: Config, out: Path) -> None:
             cfg,
             agent,
             trained,
-            method="vail",
             expert=expert,
             demo=demo,
             reward=reward,

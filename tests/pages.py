@@ -1,5 +1,6 @@
 """What each page needs before it is run, and what must hold after it, see test_pages.py."""
 
+import importlib.util
 from pathlib import Path
 
 import pytest
@@ -128,7 +129,23 @@ def demonstrations_after(_):
     assert Path("breakout.gif").is_file() and Path("again.npz").is_file()
 
 
+def ball(*_):
+    """What the script leaves in the folder, and the run."""
+    path = Path(__file__).parents[1] / "docs/tutorials/giril_on_your_environment.py"
+    spec = importlib.util.spec_from_file_location("ball", path)
+    tutorial = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(tutorial)
+    Path("ball").mkdir()
+    tutorial.play(Path("ball/ball.npz"), episodes=1)
+    Path("runs/ball").mkdir(parents=True)
+
+
+def ball_after(_):
+    assert Demonstration.load("demos/ball").card["env_id"] == "ball_on_beam:BallOnBeam-v0"
+
+
 OF = {
+    "docs/tutorials/giril_on_your_environment.py": (ball, ball_after),
     "README.md": (readme, readme_after),
     "docs/quickstart.md": (runs, nothing),
     "docs/reproduce.md": (study_of("games.yaml"), nothing),

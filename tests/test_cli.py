@@ -121,6 +121,24 @@ def test_module_runs_as_a_script_and_returns_its_exit_code():
         (["eval", "nowhere"], "there is no run folder nowhere."),
         (["eval", ".", "--episodes", "0"], "--episodes 0: at least 1 is needed."),
         (["eval", ".", "--seed", "-1"], "--seed -1: at least 0 is needed."),
+        (
+            ["eval", ".", "--seed", "99999999999999999999999"],
+            "--seed 99999999999999999999999: at most 9223372036854775807 is possible.",
+        ),
+        (
+            ["run", "giril", "seed=99999999999999999999999"],
+            "seed=99999999999999999999999: at most 9223372036854775807 is possible.",
+        ),
+        (
+            ["eval", ".", "--import", "my_envs"],
+            "there is no module my_envs among the installed packages or in HERE: install it, or "
+            "put it there.",
+        ),
+        (
+            ["run", "giril", "-m", "profile=released", "eval.episodes=5,6"],
+            "two jobs are the same run, runs/giril/inverted_pendulum/default/seed0: leave one of "
+            "them out.",
+        ),
         (["study"], "name a study: `giril study --help` shows them."),
         (["study", "smok"], "'smok' is not a study; did you mean 'smoke'?"),
         (["study", "no.yaml"], "there is no file no.yaml: write the study there, or name another."),
@@ -132,7 +150,7 @@ def test_module_runs_as_a_script_and_returns_its_exit_code():
 )
 def test_refusals(argv, sentence, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert refused(capsys, *argv) == sentence
+    assert refused(capsys, *argv) == sentence.replace("HERE", str(tmp_path))
 
 
 def test_traceback_is_shown_when_asked_for(capsys):
@@ -185,6 +203,21 @@ def test_copy_runs_with_its_own_changed_default(capsys, fake, monkeypatch):
     assert kept["steps"] == 1_000_000
 
 
+def test_a_copy_whose_runs_would_have_another_recipes_name_is_refused(capsys, fake):
+    assert main(["cp", "giril", "gail.py"]) == main(["cp", "control", "mine.py"]) == 0
+    assert refused(capsys_cleared(capsys), "run", "gail.py") == (
+        "gail.py has the name of the recipe gail, whose runs its own would be taken for: rename "
+        "both files."
+    )
+    text = Path("mine.py").read_text()
+    Path("mine.py").write_text(text.replace("recipe=Path(__file__).stem", 'recipe="control"'))
+    line = text[: text.index("recipe=Path")].count("\n") + 1
+    assert refused(capsys, "run", "mine.py") == (
+        f"{Path('mine.py').resolve()}, line {line}: its runs would be called 'control', not "
+        "'mine' as the file: write recipe=Path(__file__).stem."
+    )
+
+
 def capsys_cleared(capsys):
     capsys.readouterr()
     return capsys
@@ -204,8 +237,11 @@ def test_imports_of_main_alone_are_not_run_for_help_and_refusals(fake, capsys):
     assert main(["run", fake, "--help"]) == 0
     assert "width" in capsys.readouterr().out
     assert refused(capsys, "run", fake, "width=x") == "width=x: a whole number is needed."
-    assert main(["run", fake]) == 1
-    assert "No module named 'not_installed_here'" in capsys.readouterr().err
+    here = Path.cwd()
+    assert refused(capsys, "run", fake) == (
+        f"{here}/fake.py imports not_installed_here, and there is no such module among the "
+        f"installed packages or in {here}: install it, or put it there."
+    )
 
 
 def test_a_group_beside_a_copy_adds_to_the_shipped_one(fake):
@@ -261,7 +297,7 @@ def test_sweep_runs_every_combination(fake, capsys):
 def test_sweep_goes_on_after_a_failure_and_lists_it(fake, capsys):
     assert main(["run", fake, "crash=user,bug,no", "--multirun"]) == 1
     captured = capsys.readouterr()
-    assert Path("runs/fake/inverted_pendulum/crash=no/seed0/config.json").is_file()
+    assert Path("runs/fake/inverted_pendulum/default/seed0/config.json").is_file()
     assert "giril: the demonstration is empty: record a longer one.\n" in captured.err
     assert "RuntimeError: boom" in captured.err
     tail = ["giril: 2 of 3 jobs failed:", "  fake.py crash=user", "  fake.py crash=bug"]

@@ -60,6 +60,7 @@ def test_images_are_described(images, capsys):
     scores = [f"{score:.1f}" for score in images.returns.tolist()]
     assert shown(capsys, "images") == [
         "task         pixels (None)",
+        f"id           {images.demo_id}",
         "transitions  8",
         "episodes     3, each up to the first lost life",
         "observation  images 3 x 5 x 4",
@@ -76,7 +77,7 @@ def test_images_are_described(images, capsys):
 
 
 def test_vectors_are_described(vectors, capsys):
-    assert shown(capsys, "vectors")[3:] == [
+    assert shown(capsys, "vectors")[4:] == [
         "observation  2 numbers",
         "actions      1 number from 0.00 to 1.00",
         "played       sampled, seed 3",

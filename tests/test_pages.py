@@ -1,14 +1,20 @@
 """All that the pages show: Python blocks run, commands are checked, YAML is read, links lead on.
 
+The commands in docstrings, of the package, the recipes and the tutorials, are checked as well.
+
 A page is gone through from top to bottom, in an empty folder and one namespace, after what
 ``pages.py`` prepares for it. ``giril run`` and ``giril study`` are composed and validated but start
 nothing; what else ``giril`` does is done. A block that cannot run says why in the line above it:
 ``<!-- not run: reason -->``.
 """
 
+import argparse
+import ast
 import re
 import shlex
+import shutil
 import subprocess
+import sys
 import tomllib
 from dataclasses import replace
 from pathlib import Path
@@ -19,6 +25,7 @@ import pytest
 import yaml
 
 from giril_rl.cli import main
+from giril_rl.cli_parser import Parser
 from giril_rl.recipe_config import config_class
 from giril_rl.recipes import Recipe
 from giril_rl.study.spec import Spec, read_spec
@@ -30,7 +37,14 @@ BLOCK = re.compile(r"(?:^<!-- not run: (.+) -->\n)?^```(\S*)[^\n]*\n(.*?)^```$",
 LANGUAGES = {"python", "sh", "yaml", "text", "{toctree}", "{eval-rst}", "{literalinclude}"}
 ELSEWHERE = {"ray", "pytest", "sphinx-build", "pre-commit"}  # Commands that are not ours.
 INLINE = re.compile(r"`(giril (?:run|study|cp|ls|eval|demo|report)\b[^`]*)`")
-PLACEHOLDER = re.compile(r"\b[A-Z]{2,}\b|…|\.\.\.")
+SHOWN = re.compile(r"^ +((?:giril|python|cp) .+)$", re.M)  # In a docstring.
+PLACEHOLDER = re.compile(r"…|\.\.\.")
+STAND_INS = {"RECIPE": "giril", "TASK": "hopper", "NAME": "constant", "S": "0"}
+CODE = sorted(
+    path
+    for pattern in ("giril_rl/**/*.py", "recipes/*.py", "docs/tutorials/*.py")
+    for path in ROOT.glob(pattern)
+)
 CHECKED = set()  # Commands that no file of a page's changes.
 EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
 
@@ -62,6 +76,39 @@ def first_of_each(path):
     return Spec(spec.name, spec.title, tuple(groups))
 
 
+def docstrings(path):
+    """The text of all docstrings of a file."""
+    kinds = (ast.Module, ast.ClassDef, ast.FunctionDef)
+    nodes = [n for n in ast.walk(ast.parse(path.read_text("utf-8"))) if isinstance(n, kinds)]
+    return "\n\n".join(ast.get_docstring(node) or "" for node in nodes)
+
+
+def inline(text):
+    """The commands in running text that say more than a command's name."""
+    for line in dict.fromkeys(INLINE.findall(" ".join(text.split()))):
+        words = [STAND_INS.get(word, word) for word in re.split(r"(\W)", line)]
+        line = "".join(words)
+        least = 3 if line.startswith("giril demo") else 2  # A name alone is no command.
+        if len(line.split()) > least and not PLACEHOLDER.search(line):
+            yield line
+
+
+class Parsed(BaseException):
+    """A command line was understood; nothing is done."""
+
+
+def understood(line, monkeypatch):
+    """Parses a command of which only the words are known."""
+
+    def parse(parser, argv):
+        raise Parsed(argparse.ArgumentParser.parse_args(parser, argv))
+
+    monkeypatch.setattr(Parser, "parse_args", parse)
+    with pytest.raises((Parsed, SystemExit)):  # The latter after --help.
+        main(shlex.split(line)[1:])
+    monkeypatch.undo()
+
+
 @pytest.fixture
 def dry(monkeypatch, tmp_path):
     """An empty folder, where ``giril run`` and others do all but their work."""
@@ -73,6 +120,7 @@ def dry(monkeypatch, tmp_path):
         return run
 
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path])
     monkeypatch.setattr(Recipe, "load", load)
     monkeypatch.setattr("giril_rl.study.command.read_spec", first_of_each)
     monkeypatch.setattr("giril_rl.training.finished.evaluate_run", lambda *words: None)
@@ -90,8 +138,10 @@ def check(line, capsys):
     elif words[0] == "pip":
         wanted = re.findall(r"\[([\w,]+)\]", line)
         assert all(extra in EXTRAS for extra in ",".join(wanted).split(",") if extra), line
+    elif words[0] == "cp":
+        shutil.copy(ROOT / words[1], words[2])
     elif words[0] in ("python", "bash"):
-        assert (ROOT / words[1]).is_file(), line
+        assert (ROOT / words[1]).is_file() or Path(words[1]).is_file(), line
     else:
         assert words[0] == "giril", f"{line}: neither ours nor known, see ELSEWHERE"
         if words[1] == "study" and "--help" not in words:
@@ -122,17 +172,40 @@ def test_all_that_a_page_shows_holds(name, dry, monkeypatch, capsys):
     after(names)
 
 
+def check_inline(text, capsys):
+    for line in inline(text):
+        words = line.split()
+        if words[1] in ("demo", "eval", "report", "ls"):
+            with pytest.MonkeyPatch.context() as patch:
+                understood(line, patch)
+        elif words[1] == "cp" or not words[2].endswith((".py", ".yaml")):  # Files of the reader's.
+            check(line, capsys)
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_commands_in_the_text_hold_too(name, dry, capsys):
     if name in pages.GENERATED:
         pytest.skip("written by `giril report`")
-    text = BLOCK.sub("", (ROOT / name).read_text(encoding="utf-8"))
-    for line in dict.fromkeys(INLINE.findall(" ".join(text.split()))):
-        words = line.split()
-        if not PLACEHOLDER.search(line) and words[1] in ("run", "study", "cp") and len(words) > 2:
-            if words[1] != "cp" and words[2].endswith((".py", ".yaml")):
-                continue  # A file of the reader's.
+    check_inline(BLOCK.sub("", (ROOT / name).read_text(encoding="utf-8")), capsys)
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")
+@pytest.mark.parametrize("folder", ["giril_rl", "recipes", "docs/tutorials"])
+def test_commands_in_docstrings_hold_too(folder, dry, monkeypatch, capsys):
+    found = 0
+    for path in CODE:
+        name = path.relative_to(ROOT).as_posix()
+        if not name.startswith(folder):
+            continue
+        text = docstrings(path)
+        check_inline(text, capsys)
+        before, after = pages.OF.get(name, (pages.nothing, pages.nothing))
+        before(monkeypatch, None)
+        for line in SHOWN.findall(text):
             check(line, capsys)
+            found += 1
+        after({})
+    assert found or folder != "docs/tutorials"
 
 
 def test_few_blocks_are_not_run():
@@ -153,3 +226,9 @@ def test_links_lead_to_files_that_are_there():
 def test_a_wrong_command_is_found(line, dry, capsys):
     with pytest.raises(AssertionError):
         check(line, capsys)
+
+
+@pytest.mark.parametrize("line", ["giril eval RUN --epsodes 3", "giril demo fly", "giril report"])
+def test_a_command_with_other_words_is_not_understood(line, dry, monkeypatch):
+    with pytest.raises(pytest.fail.Exception):
+        understood(line, monkeypatch)

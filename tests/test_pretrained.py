@@ -1,10 +1,11 @@
 import json
+import math
 
 import pytest
 import torch
 from tensordict import TensorDict
 from torch import nn
-from torchrl.data import Bounded, Categorical, Unbounded
+from torchrl.data import Bounded, Categorical, OneHot, Unbounded
 
 from giril_rl.errors import UserError
 from giril_rl.networks.agents import load_agent_from
@@ -78,14 +79,35 @@ def test_pixels_keys_and_noise_come_back(tmp_path):
     [
         ActorCritic(3, BOX),
         ActorCritic(3, Categorical(4, shape=(1,)), hidden=[8], normalise=False),
+        ActorCritic(3, OneHot(4)),
         PixelActorCritic(6),
+        PixelActorCritic(OneHot(6)),
     ],
 )
 def test_a_policy_comes_back_whichever_it_is(agent, tmp_path):
     again = load_agent_from(agent.save_pretrained(tmp_path))
     assert type(again) is type(agent)
+    assert (again.made_with, again.one_hot) == (agent.made_with, agent.one_hot)
     for name, value in agent.state_dict().items():
         assert torch.equal(again.state_dict()[name], value), name
+
+
+def test_a_policy_from_before_actions_were_scaled_is_read_where_it_acts_the_same(tmp_path):
+    plain = ActorCritic(3, Bounded(-1.0, 1.0, shape=(2,)))
+    half_bounded = ActorCritic(3, Bounded(torch.tensor([0.0]), torch.tensor([math.inf])))
+    for number, agent in enumerate((plain, half_bounded, ActorCritic(3, Unbounded((1,))))):
+        folder = agent.save_pretrained(tmp_path / str(number))
+        assert json.loads((folder / "card.json").read_text())["format_version"] == 1
+        again = load_agent_from(folder)
+        assert again.acting_keys == agent.acting_keys
+        if agent.bounds is not None:
+            assert torch.equal(again.bounds.high, agent.bounds.high)
+    folder = ActorCritic(3, BOX).save_pretrained(tmp_path / "scaled")
+    assert load_agent_from(folder).bounds.offset.tolist() == [0.0, 2.0]
+    with pytest.raises(
+        UserError, match=r"has format 1, of a policy or reward that .*train it anew"
+    ):
+        load_agent_from(changed(folder, format_version=1))
 
 
 def saved(tmp_path):

@@ -188,9 +188,11 @@ def test_a_finished_command_does_not_train_again(root, tmp_path, monkeypatch, ca
     run("giril", tmp_path, root)
     before, shown = stamps(tmp_path), capsys.readouterr().out
     monkeypatch.setattr(GymVectorEnv, "_step", None)
-    run("giril", tmp_path, root)
+    run("giril", tmp_path, root, "ppo.checkpoint_every=100", "fit.log_every=7")
     assert stamps(tmp_path) == before
-    assert capsys.readouterr().out == shown
+    again = capsys.readouterr()
+    assert again.out == shown
+    assert again.err == f"giril: {tmp_path} was finished earlier: nothing was run.\n"
 
 
 @pytest.mark.parametrize("recipe", EXTRA)

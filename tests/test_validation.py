@@ -18,7 +18,7 @@ from giril_rl.configs import (
     knob,
 )
 from giril_rl.errors import UserError
-from giril_rl.validation import validate
+from giril_rl.validation import notices, validate
 
 
 @dataclass
@@ -59,6 +59,16 @@ def test_defaults_pass():
         ),
         ("scaling.reset", "x", "scaling.reset=x: choose one of never, done."),
         ("logger", "x", "logger=x: choose one of tensorboard, csv, wandb, mlflow, null."),
+        ("seed", 2**63, "seed=9223372036854775808: at most 9223372036854775807 is possible."),
+        ("reward.seed", 10**200, "reward.seed=...: at most 9223372036854775807 is possible."),
+        (
+            "ppo.hidden",
+            [8, 2**63],
+            "ppo.hidden=[8,9223372036854775808]: at most 9223372036854775807 is possible.",
+        ),
+        ("threads", 2**40, "threads=1099511627776 must be in [1, 1024]."),
+        ("imports", ["my_envs.py"], "'my_envs.py' is a file: import it by its name, my_envs."),
+        ("imports", ["a b"], "'a b' is not the name of a module: write one such as my_envs."),
     ],
 )
 def test_refused_with_one_sentence(key, value, sentence):
@@ -109,24 +119,35 @@ def test_minibatch_divides_the_batch(num_envs, rollout, minibatch, fits):
             validate(config)
 
 
-@pytest.mark.parametrize(("steps", "near"), [(1_999, "give 2000"), (15_000, "give 14000 or 16000")])
-def test_steps_are_whole_batches(steps, near):
+@pytest.mark.parametrize(
+    ("steps", "taken"), [(1, "2,000"), (1_999, "2,000"), (15_000, "16,000"), (16_000, None)]
+)
+def test_steps_are_rounded_up_to_whole_batches(steps, taken):
     config = good()
     config.steps = steps
-    with pytest.raises(UserError, match=rf"steps={steps} is no whole number .*: {near}\."):
-        validate(config)
-
-
-def test_steps_of_the_expert_are_whole_batches():
-    @dataclass
-    class WithExpert(RunConfig):
-        expert: ExpertConfig = field(default_factory=lambda: ExpertConfig(steps=12_345))
-
-    config = WithExpert(task=TaskConfig(name="reach", env_id="Reach-v0"), steps=10_000)
-    with pytest.raises(UserError, match=r"expert\.steps=12345 is no whole number"):
-        validate(config)
-    config.expert.path = "somewhere"
     validate(config)
+    batch = "is no multiple of a batch (16 * 125 = 2,000)"
+    told = [f"steps={steps} {batch}: {taken} steps are taken."] if taken else []
+    assert notices(config) == told
+
+
+@dataclass
+class WithExpert(RunConfig):
+    expert: ExpertConfig = field(default_factory=lambda: ExpertConfig(steps=12_345))
+    demo: DemoConfig = field(default_factory=DemoConfig)
+
+
+def test_so_are_steps_of_an_expert_that_is_trained():
+    config = WithExpert(task=TaskConfig(name="reach", env_id="Reach-v0"), steps=10_000)
+    validate(config)
+    (told,) = notices(config)
+    assert told.startswith("expert.steps=12345 ") and told.endswith(": 14,000 steps are taken.")
+    for part in (config.expert, config.demo):
+        part.path = "somewhere"
+        assert notices(config) == []
+        part.path = None
+    config.expert.steps, config.task.expert_steps = None, 1_999
+    assert notices(config)[0].startswith("task.expert_steps=1999 ")
 
 
 @pytest.mark.parametrize(
@@ -216,21 +237,16 @@ def test_games_have_no_fixed_horizon(after_failure):
     validate(config)
 
 
-@pytest.mark.parametrize(("steps", "fits"), [(2048, True), (2000, False)])
-def test_steps_of_atari_s_expert_are_its_own_batches(steps, fits):
+@pytest.mark.parametrize(("steps", "taken"), [(2048, None), (2000, "2,048")])
+def test_steps_of_atari_s_expert_are_its_own_batches(steps, taken):
     """8 games and 128 steps, whatever the recipe's own PPO has."""
-
-    @dataclass
-    class WithExpert(RunConfig):
-        expert: ExpertConfig = field(default_factory=lambda: ExpertConfig(steps=steps))
-
-    config = WithExpert(task=TaskConfig(name="pong", env_id="ALE/Pong-v5"), steps=10_000)
+    task = TaskConfig(name="pong", env_id="ALE/Pong-v5")
+    config = WithExpert(task=task, steps=10_000, expert=ExpertConfig(steps=steps))
     config.ppo.normalise_observations = False
-    if fits:
-        validate(config)
-    else:
-        with pytest.raises(UserError, match=r"^expert\.steps=2000 .* give 1024 or 2048\.$"):
-            validate(config)
+    validate(config)
+    batch = "is no multiple of a batch (8 * 128 = 1,024)"
+    told = [f"expert.steps={steps} {batch}: {taken} steps are taken."] if taken else []
+    assert notices(config) == told
 
 
 def test_an_expert_plays_the_task_as_it_is():

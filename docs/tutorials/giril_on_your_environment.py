@@ -10,11 +10,13 @@ and with GIRIL's near an end, for GIRIL pays for what its model foresees badly.
 
     python docs/tutorials/giril_on_your_environment.py --steps 60000
 
-The command line does the same with ``import ball_on_beam`` (the class and its registration) at the
-top of a copied recipe, ``giril cp giril mine.py``:
+The command line does the same with this file as a module of your own, in the current folder:
 
-    giril demo import ball.npz --env-id BallOnBeam-v0 --out demos/ball
-    giril run mine.py task.env_id=BallOnBeam-v0 demo.path=demos/ball
+    cp docs/tutorials/giril_on_your_environment.py ball_on_beam.py
+    python ball_on_beam.py --folder ball
+    giril demo import ball/ball.npz --env-id ball_on_beam:BallOnBeam-v0 --out demos/ball
+    giril run giril task.env_id=ball_on_beam:BallOnBeam-v0 demo.path=demos/ball out=runs/ball
+    giril eval runs/ball --import ball_on_beam
 """
 
 from __future__ import annotations
@@ -134,6 +136,7 @@ def main(
 ) -> dict[str, Scores]:
     """Runs all of it and returns the scores of each player."""
     folder = Path(tempfile.mkdtemp()) if folder is None else folder
+    folder.mkdir(parents=True, exist_ok=True)
     play(folder / "ball.npz")
     demo = import_demonstration(str(folder / "ball.npz"), TASK)
     demo.save(folder / "demo")
@@ -153,8 +156,11 @@ def main(
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--steps", type=int, default=60 * 1024, help="a multiple of 1,024")
+    parser.add_argument("--steps", type=int, default=60 * 1024, help="rounded up to 1,024s")
+    parser.add_argument(
+        "--folder", type=Path, help="where to keep all of it; if not given, nowhere"
+    )
     args = parser.parse_args()
-    for name, scores in main(args.steps).items():
+    for name, scores in main(args.steps, folder=args.folder).items():
         length = scores.episode_length_mean
         print(f"{name:16} return {scores.return_mean:5.1f}, {length:5.1f} of 200 steps")

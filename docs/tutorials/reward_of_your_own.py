@@ -112,7 +112,7 @@ def main(
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--steps", type=int, default=60 * 1024, help="a multiple of 1,024")
+    parser.add_argument("--steps", type=int, default=60 * 1024, help="rounded up to 1,024s")
     args = parser.parse_args()
     for name, scores in main(args.steps).items():
         print(f"{name:16} true return {scores.return_mean:5.1f} of 500")

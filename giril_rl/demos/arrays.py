@@ -9,6 +9,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
+from giril_rl.demos.names import check_names
 from giril_rl.errors import UserError
 
 NEEDED = ("observation", "action", "next_observation", "terminated", "truncated")
@@ -42,9 +43,7 @@ def to_transitions(columns: Mapping[str, np.ndarray]) -> TensorDict:
         >>> data["episode"].tolist(), data["step"].tolist(), data["next", "reward"].shape
         ([0, 0, 1], [0, 1, 0], torch.Size([3, 1]))
     """
-    for name in NEEDED:
-        if name not in columns:
-            raise UserError(_missing(name))
+    check_names(columns, NEEDED, "the data set has no")
     lengths = {name: len(column) if column.ndim else 0 for name, column in columns.items()}
     length = lengths["action"]
     for name, found in lengths.items():
@@ -136,15 +135,6 @@ def from_episodes(episodes: Iterable[Mapping[str, np.ndarray]]) -> dict[str, np.
         return {name: np.concatenate(rows) for name, rows in parts.items()}
     except (ValueError, TypeError) as error:
         raise UserError(f"the data set's episodes do not fit each other ({error}).") from None
-
-
-def _missing(name: str) -> str:
-    if name == "next_observation":
-        return (
-            "the data set has no next_observation, so next states are missing: give them, or "
-            "observations with one row more than actions in each episode."
-        )
-    return f"the data set has no {name}: needed are {', '.join(NEEDED)}."
 
 
 def _described(array: np.ndarray) -> str:

@@ -25,7 +25,6 @@ FORMAT_VERSION = 1
 IMAGE_FORMAT_VERSION = 2
 """Of images, which lie in a file of their own."""
 
-
 _AT_ONCE = 10_000
 _IMAGES: list[NestedKey] = ["observation", ("next", "observation")]
 
@@ -105,7 +104,7 @@ class Demonstration:
             values = self.transitions.get(key)
             digest.update(f"{key}{values.dtype}{tuple(values.shape)}".encode())
             for part in values.split(_AT_ONCE):
-                digest.update(part.contiguous().numpy())
+                digest.update(part.cpu().contiguous().numpy())
         return digest.hexdigest()[:12]
 
     def save(self, folder: Path | str) -> None:

@@ -12,6 +12,7 @@ from giril_rl.configs import TaskConfig
 from giril_rl.demos.arrays import to_transitions
 from giril_rl.demos.demonstration import Demonstration
 from giril_rl.demos.minari_read import read_minari
+from giril_rl.demos.names import check_names
 from giril_rl.demos.npz import read_npz
 from giril_rl.demos.replay import verify_by_replay
 from giril_rl.demos.storage import load_tensors
@@ -22,6 +23,7 @@ from giril_rl.files import installed_versions
 
 MINARI = "minari:"
 _DTYPES = ("float32", "float64", "uint8", "int8", "int16", "int32", "int64", "bool")
+_NEEDED = ("observation", "action", "next.observation", "next.terminated", "next.truncated")
 _NEXT = {"observation": "next_observation", "reward": "reward"}
 _Read = tuple[dict[str, np.ndarray], dict[str, Any]]
 
@@ -117,6 +119,10 @@ def _read_memmap(folder: Path) -> dict[str, np.ndarray]:
             f"{folder} has the batch shape {list(data.shape)}: flatten it to [N] transitions, "
             "episode after episode."
         )
+    found = [
+        key if isinstance(key, str) else ".".join(key) for key in data.keys(True, leaves_only=True)
+    ]
+    check_names(found, _NEEDED, f"{folder} has no")
     keys: dict[str, Any] = {name: name for name in ("observation", "action", "episode", "step")}
     keys |= {_NEXT.get(name, name): ("next", name) for name in (*_NEXT, "terminated", "truncated")}
     columns = {

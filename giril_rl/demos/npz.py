@@ -14,6 +14,7 @@ import numpy as np
 
 from giril_rl.demos.arrays import NEEDED, from_episodes
 from giril_rl.demos.demonstration import Demonstration
+from giril_rl.demos.names import check_names, renamed
 from giril_rl.errors import UserError
 from giril_rl.files import sync, temporary_sibling
 from giril_rl.nearest import did_you_mean
@@ -112,10 +113,28 @@ def _names(archive: zipfile.ZipFile) -> list[str]:
     for file, name in zip(files, names, strict=True):
         if names.count(name) > 1:
             raise UserError(f"the .npz file holds {file!r} twice: write it anew.")
-        if name not in _KNOWN or file == name:
-            hint = did_you_mean(name, _KNOWN) or "; leave it out."
-            raise UserError(f"{file!r} in the .npz file is not an array of a demonstration{hint}")
+        if file == name:
+            raise UserError(f"{file!r} in the .npz file is not an array: leave it out.")
+    _check_names(names)
     return names
+
+
+def _check_names(names: list[str]) -> None:
+    """Refuses a file with names of neither kind, or without some of the kind that it is."""
+
+    def likeness(form: tuple[str, ...]) -> tuple[int, int]:
+        same = len(set(form) & set(names))
+        return same + len(renamed(names, form)), same
+
+    whole = "lengths" in names
+    needed = EPISODES if whole else max(NEEDED, EPISODES, key=likeness)
+    check_names(names, needed, f"the .npz file has {'lengths and ' if whole else ''}no")
+    for name in names:
+        if name not in _KNOWN:
+            hint = did_you_mean(name, _KNOWN) or "; leave it out."
+            raise UserError(
+                f"'{name}.npy' in the .npz file is not an array of a demonstration{hint}"
+            )
 
 
 def _array(archive: zipfile.ZipFile, name: str) -> np.ndarray:
@@ -149,9 +168,6 @@ def _card(array: np.ndarray | None) -> dict[str, Any]:
 
 
 def _whole(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    for name in EPISODES:
-        if name not in arrays:
-            raise UserError(f"the .npz file has lengths and no {name}: add it, for each episode.")
     foreign = sorted(set(arrays) - {*EPISODES, "rewards"})
     if foreign:
         raise UserError(

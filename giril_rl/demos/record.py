@@ -99,7 +99,7 @@ def record_demonstration(
         )
     env = make_fn()
     check_action_space(env.action_space, env_name(env))
-    rows: list[dict[str, Any]] = []
+    parts: list[TensorDict] = []
     seeds: list[int] = []
     lives_left: list[list[int]] = []
     distinct, numbers = DistinctEpisodes(episodes or 0), count()
@@ -108,11 +108,11 @@ def record_demonstration(
         with (
             seeded(episode_seed(seed, 0)),
             torch.no_grad(),
-            progress(total or 0, desc="demonstration", unit=unit) as bar,
+            progress(total or 0, desc="demonstration", unit=unit, disable=not show_progress) as bar,
         ):
-            while len(rows) < length if length is not None else len(seeds) < (episodes or 0):
+            while bar.done < (total or 0):
                 own = episode_seed(seed, next(numbers))
-                most = _LONGEST_EPISODE if length is None else length - len(rows)
+                most = _LONGEST_EPISODE if length is None else length - bar.done
                 played, counted = _play(env, policy, own, most)
                 if length is None and not played[-1]["done"]:
                     raise UserError(
@@ -123,11 +123,11 @@ def record_demonstration(
                     continue
                 seeds.append(own)
                 lives_left.append(counted)
-                rows += [{"episode": len(seeds) - 1, "step": i, **r} for i, r in enumerate(played)]
+                parts.append(_stack(played, len(parts)))
                 bar.update(1 if length is None else len(played))
     finally:
         env.close()
-    demo = Demonstration(_stack(rows))
+    demo = Demonstration(TensorDict.cat(parts))
     demo.card = {
         "task": task,
         "env_id": env.spec.id if env.spec is not None else None,
@@ -206,7 +206,7 @@ def _choose(
     return int(output)
 
 
-def _stack(rows: list[dict[str, Any]]) -> TensorDict:
+def _stack(rows: list[dict[str, Any]], episode: int) -> TensorDict:
     def column(name: str, dtype: torch.dtype | None = None) -> Tensor:
         return torch.as_tensor(np.stack([row[name] for row in rows]), dtype=dtype)
 
@@ -219,8 +219,8 @@ def _stack(rows: list[dict[str, Any]]) -> TensorDict:
         {
             "observation": column("observation"),
             "action": column("action", torch.int64 if discrete else torch.float32),
-            "episode": column("episode", torch.int64),
-            "step": column("step", torch.int64),
+            "episode": torch.full((len(rows),), episode),
+            "step": torch.arange(len(rows)),
             "next": TensorDict(after, [len(rows)]),
         },
         [len(rows)],

@@ -23,6 +23,7 @@ def describe(demo: Demonstration) -> str:
         ... )
         >>> print(describe(demo))
         task         cartpole (CartPole-v1)
+        id           ...
         transitions  15
         episodes     2
         observation  4 numbers
@@ -41,6 +42,7 @@ def describe(demo: Demonstration) -> str:
     played = _PLAYED.get(str(card.get("deterministic")), "not known how")
     rows = {
         "task": f"{card.get('task')} ({card.get('env_id')})",
+        "id": demo.demo_id,
         "transitions": f"{len(demo):,}",
         "episodes": f"{demo.num_episodes:,}{_LIVES.get(lives, '')}",
         "observation": images if demo.has_images else _numbers(shape[0]),

@@ -28,16 +28,27 @@ def save_tensors(folder: Path, transitions: TensorDict) -> None:
     Raises:
         OSError: ENOSPC if there is not room for it.
     """
-    _check_room(folder, transitions)
+    check_room(folder, transitions)
     transitions.detach().cpu().contiguous().memmap(folder, copy_existing=True)
     for path in sorted(folder.rglob("*"), reverse=True):
         sync(path)
 
 
-def _check_room(folder: Path, transitions: TensorDict) -> None:
-    # A disk that is full while a memory map is filled kills the process without a word.
+def check_room(folder: Path, transitions: TensorDict, *, more: int = _PAGE) -> None:
+    """Refuses to begin where a disk that fills up ends the process without a word.
+
+    A memory map and HDF5 both do that.
+
+    Args:
+        folder: what is to be written; it need not be there.
+        transitions: what is to be written there.
+        more: bytes besides the numbers, for each tensor.
+
+    Raises:
+        OSError: ENOSPC if there is not room for it.
+    """
     tensors = list(transitions.values(include_nested=True, leaves_only=True))
-    needed = sum(x.numel() * x.element_size() + _PAGE for x in tensors)
+    needed = sum(x.numel() * x.element_size() + more for x in tensors)
     place = next(parent for parent in folder.absolute().parents if parent.exists())
     room = shutil.disk_usage(place)
     if room.total and room.free < needed:  # Some file systems do not say: 0 of 0.

@@ -9,7 +9,7 @@ from dataclasses import replace
 from omegaconf import OmegaConf
 from torchrl.data import TensorSpec
 
-from giril_rl.configs import TaskConfig
+from giril_rl.configs import TaskConfig, split_id
 from giril_rl.demos.check import check_demonstration
 from giril_rl.demos.demonstration import Demonstration
 from giril_rl.envs import make_env, with_own_episodes
@@ -82,7 +82,7 @@ def check_environment(demo: Demonstration, task: TaskConfig) -> None:
 
 
 def _named(env_id: str) -> str:
-    return re.sub(r"-v\d+$", "", env_id)
+    return re.sub(r"-v\d+$", "", split_id(env_id)[1])
 
 
 def check_for_task(demo: Demonstration, task: TaskConfig) -> None:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import contextlib
 import importlib
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from typing import cast
 
 import gymnasium
 
-from giril_rl.configs import TaskConfig
+from giril_rl.configs import TaskConfig, split_id
 from giril_rl.envs.atari import AtariEnv, Episode
 from giril_rl.envs.atari_game import FRAME_CAP
 from giril_rl.envs.atari_gym import AtariGymEnv
@@ -31,10 +32,12 @@ def gym_factory(task: TaskConfig) -> Callable[[], gymnasium.Env]:
 
     Args:
         task: the task; ids ending in ``BulletEnv-v0`` come from ``pybullet_envs_gymnasium``, those
-            that begin with ``ALE/`` are :class:`AtariGymEnv`, preprocessed.
+            that begin with ``ALE/`` are :class:`AtariGymEnv`, preprocessed. ``MODULE:ID`` is one
+            that a module registers, which the caller has imported: the task may be of a run that
+            somebody sent.
 
     Raises:
-        UserError: if the id is unknown, its package is missing, or it has no time limit.
+        UserError: if the id is unknown, its module or package is missing, or it has no time limit.
 
     Examples:
         >>> gym_factory(TaskConfig(name="cartpole", env_id="CartPole-v1"))().spec.id
@@ -64,7 +67,7 @@ def gym_factory(task: TaskConfig) -> Callable[[], gymnasium.Env]:
         bullet = BULLET in task.env_id
         try:
             with silent_stdout(stderr=True) if bullet else contextlib.nullcontext():
-                env = gymnasium.make(task.env_id, max_episode_steps=limit, disable_env_checker=True)
+                env = gymnasium.make(spec.id, max_episode_steps=limit, disable_env_checker=True)
                 if bullet:
                     env.reset()
         except gymnasium.error.DependencyNotInstalled as error:
@@ -75,11 +78,24 @@ def gym_factory(task: TaskConfig) -> Callable[[], gymnasium.Env]:
 
 
 def _spec(task: TaskConfig) -> gymnasium.envs.registration.EnvSpec:
+    module, env_id = split_id(task.env_id)
+    if module is not None and module not in sys.modules:
+        raise UserError(
+            f"task.env_id={task.env_id} is not a Gymnasium id here: its module {module} is not "
+            f"imported; name it with imports=[{module}] or --import {module}, or import it."
+        )
     try:
-        return gymnasium.spec(task.env_id)
+        return gymnasium.spec(env_id)
     except gymnasium.error.Error:
-        hint = did_you_mean(task.env_id, gymnasium.registry) or "; check its name and package."
-        raise UserError(f"task.env_id={task.env_id} is not a Gymnasium id{hint}") from None
+        if module is not None:
+            who = f"is not a Gymnasium id that {module} registers"
+            hint = did_you_mean(env_id, gymnasium.registry) or ": check its name."
+        else:
+            who = "is not a Gymnasium id"
+            hint = did_you_mean(env_id, gymnasium.registry) or (
+                "; check its name, or name the module that registers it: MODULE:ID."
+            )
+        raise UserError(f"task.env_id={task.env_id} {who}{hint}") from None
 
 
 def _game(task: TaskConfig) -> str:

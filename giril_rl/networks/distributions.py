@@ -1,4 +1,4 @@
-"""The two action distributions of PPO, with nothing around them.
+"""The action distributions of PPO, with nothing around them.
 
 They compute what ``torch.distributions`` does (the tests hold them to it) without that module's
 argument checks and broadcasting, which at these network sizes cost as much as the network.
@@ -87,3 +87,31 @@ class CategoricalActions:
     def entropy(self) -> Tensor:
         """Entropy in nats, ``(*batch,)``."""
         return -(self.log_probabilities.exp() * self.log_probabilities).sum(-1)
+
+
+class OneHotActions(CategoricalActions):
+    """The same distribution over one-hot actions.
+
+    Examples:
+        >>> import torch
+        >>> OneHotActions(torch.tensor([0.0, 1.0])).mode
+        tensor([0, 1])
+    """
+
+    @property
+    def mode(self) -> Tensor:
+        """The most likely action, ``(*batch, actions)``."""
+        return self._one_hot(super().mode)
+
+    def sample(self) -> Tensor:
+        """One draw, ``(*batch, actions)`` int64, by the same random numbers."""
+        return self._one_hot(super().sample())
+
+    def log_prob(self, action: Tensor) -> Tensor:
+        """Log probability ``(*batch,)`` of one-hot actions of any dtype."""
+        return super().log_prob(action.long().argmax(-1))
+
+    def _one_hot(self, index: Tensor) -> Tensor:
+        # Not F.one_hot, which looks at the values and so cannot be recorded as a graph.
+        zeros = torch.zeros_like(self.log_probabilities, dtype=torch.int64)
+        return zeros.scatter(-1, index.unsqueeze(-1), 1)

@@ -66,8 +66,12 @@ class RunningNormaliser(nn.Module):
             observation: raw observations.
             least: smallest deviation to divide by. A good player hardly moves some of its
                 observations; divided by so little, what it never saw would be far out of range.
+
+        Raises:
+            UserError: for another size, NaN or infinity; the statistics are then as they were.
         """
         check_size(observation, self.mean)
+        _check_finite(observation)
         batch = observation.reshape(-1, observation.shape[-1]).double()
         self.mean.copy_(batch.mean(0))
         self.var.copy_(batch.var(0, correction=0).clamp(min=least**2))
@@ -77,8 +81,13 @@ class RunningNormaliser(nn.Module):
 
     @torch.no_grad()
     def update(self, observation: Tensor) -> None:
-        """Merges ``(*batch, size)`` into the statistics (Chan et al. 1983)."""
+        """Merges ``(*batch, size)`` into the statistics (Chan et al. 1983).
+
+        Raises:
+            UserError: for another size, NaN or infinity; the statistics are then as they were.
+        """
         check_size(observation, self.mean)
+        _check_finite(observation)
         batch = observation.reshape(-1, observation.shape[-1]).double()
         n = batch.shape[0]
         total = self.count + n
@@ -111,4 +120,15 @@ def check_size(observation: Tensor, statistics: Tensor) -> None:
         raise UserError(
             f"observations have shape {tuple(observation.shape)} where (*batch, "
             f"{statistics.shape[0]}) is needed."
+        )
+
+
+def _check_finite(observation: Tensor) -> None:
+    finite = observation.isfinite()
+    if not finite.all():
+        *where, entry = (~finite).nonzero()[0].tolist()
+        value = observation[(*where, entry)].item()
+        raise UserError(
+            f"an observation is not finite: {value} at entry {entry} of the one at {where} in the "
+            "batch, where running statistics would keep it for ever; mend the environment or data."
         )

@@ -8,9 +8,12 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from torch import Tensor, nn
+from torchrl.data import Categorical, OneHot, TensorSpec
 
+from giril_rl.errors import UserError
 from giril_rl.networks.acting import ActingPolicy
-from giril_rl.networks.distributions import CategoricalActions
+from giril_rl.networks.action_bounds import single_action_spec
+from giril_rl.networks.distributions import CategoricalActions, OneHotActions
 from giril_rl.networks.pixels import flat_frames
 from giril_rl.networks.space_to_depth import SpaceToDepthConv, deal
 from giril_rl.pretrained import Pretrained, remembered
@@ -31,8 +34,12 @@ class PixelActorCritic(Pretrained, nn.Module):
     leaves the trunk's output as ``"hidden"`` for the critic, so that the trunk runs once.
 
     Args:
-        actions: number of actions.
+        actions: the environment's action spec, a :class:`torchrl.data.Categorical` or OneHot, of
+            which actions have the encoding; or a number of actions, which then are integers.
         channels: frames in an observation.
+
+    Raises:
+        UserError: for an action spec of another kind.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -44,15 +51,24 @@ class PixelActorCritic(Pretrained, nn.Module):
 
     discrete = True
     log_std = None
+    bounds = None
     acting_keys = ("action", "action_log_prob", "state_value")
+    drawn_key = "action"
     input_keys: tuple[str, ...] = (DEALT,)
     """What the networks in PPO's loss read of a minibatch."""
 
     @remembered
-    def __init__(self, actions: int, channels: int = 4) -> None:
+    def __init__(self, actions: int | TensorSpec, channels: int = 4) -> None:
         super().__init__()
+        spec = Categorical(actions) if isinstance(actions, int) else single_action_spec(actions)
+        if not isinstance(spec, (Categorical, OneHot)):
+            raise UserError(
+                "a policy of frames has discrete actions: give it a Categorical or OneHot spec, or "
+                "their number."
+            )
+        self.one_hot = isinstance(spec, OneHot)
         self.normaliser = nn.Identity()
-        self.actor = PixelActor(actions, channels)
+        self.actor = PixelActor(int(spec.space.n), channels)
         self.critic = nn.Linear(512, 1)
         _orthogonal(self.critic, 1.0)
 
@@ -68,7 +84,12 @@ class PixelActorCritic(Pretrained, nn.Module):
     def distribution_and_value(self, observation: Tensor) -> tuple[CategoricalActions, Tensor]:
         """The action distribution and the value ``(*batch, 1)`` of uint8 frames, trunk run once."""
         hidden = self.hidden(observation)
-        return CategoricalActions(self.actor.head(hidden)), self.critic(hidden)
+        return self.distribution_of(hidden), self.critic(hidden)
+
+    def distribution_of(self, hidden: Tensor) -> CategoricalActions:
+        """The action distribution given the trunk's output ``(*batch, 512)``."""
+        logits = self.actor.head(hidden)
+        return OneHotActions(logits) if self.one_hot else CategoricalActions(logits)
 
     def value_network(self) -> None:
         """None: the acting policy has written the values, and :meth:`prepare` the next ones."""
@@ -95,7 +116,7 @@ class PixelActorCritic(Pretrained, nn.Module):
         """Does nothing: frames are divided by a constant."""
 
     def act(self, observation: Tensor, *, greedy: bool = False) -> tuple[Tensor, Tensor, Tensor]:
-        """An action and its log-probability, ``(*batch)`` each, and the value ``(*batch, 1)``.
+        """An action, its log-probability ``(*batch)`` and the value ``(*batch, 1)``.
 
         Args:
             observation: uint8 frames ``(*batch, channels, 84, 84)``, where the weights are.
@@ -175,6 +196,8 @@ class PixelLossActor(TensorDictModuleBase):
         super().__init__()
         self.in_keys = [DEALT]
         self.out_keys = ["action", HIDDEN]
+        self.dist_sample_keys = [agent.drawn_key]
+        self.log_prob_keys = ["action_log_prob"]
         self.agent = agent
 
     def get_dist(self, tensordict: TensorDictBase) -> CategoricalActions:
@@ -185,7 +208,7 @@ class PixelLossActor(TensorDictModuleBase):
         """
         hidden = self.agent.actor.hidden_of_dealt(tensordict.get(DEALT))
         tensordict.set(HIDDEN, hidden)
-        return CategoricalActions(self.agent.actor.head(hidden))
+        return self.agent.distribution_of(hidden)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the distribution's mode as the action."""

@@ -14,7 +14,7 @@ from giril_rl.report.drawing import new_figure, save, thousands
 from giril_rl.report.formats import budget_text, seeds_text
 from giril_rl.report.rows import Panel, Row, longest
 from giril_rl.report.statistics import band
-from giril_rl.report.style import DEMONSTRATION, EXPERT, PALETTE, Look, look
+from giril_rl.report.style import DEMONSTRATION, EXPERT, PALETTE, Look
 from giril_rl.report.tables import Table
 
 BINS = 50
@@ -84,15 +84,16 @@ def draw_results(table: Table, path: Path) -> bool:
         ("methods", [row for row in rows if not row.is_control]),
         ("controls", [row for row in rows if row.is_control]),
     ]
-    looks = [
-        [look(row.method, row.profile, number) for number, row in enumerate(part)]
-        for _, part in parts
-    ]
     return _draw(
         table.panel,
         [
-            (title, part, [row.name.removeprefix("control: ") for row in part], styles)
-            for (title, part), styles in zip(parts, looks, strict=True)
+            (
+                title,
+                part,
+                [row.name.removeprefix("control: ") for row in part],
+                [row.look for row in part],
+            )
+            for title, part in parts
             if part
         ],
         rows,
@@ -178,8 +179,10 @@ def _references(axes: Any, panel: Panel) -> None:
         ("expert", "expert", EXPERT, (0, (6, 3)), 1.0),
         ("demo", panel.demonstration, DEMONSTRATION, (0, (1, 1)), 2.2),
     ):
-        value = panel.reference(who)
-        if value is not None:
+        values = panel.references(who)
+        if values:
+            value = sum(values) / len(values)
+            name += f", mean of {len(values)}" if len(values) > 1 else ""
             axes.axhline(
                 value,
                 color=color,

@@ -37,6 +37,14 @@ COLUMNS = (
     "expert",
     "life_length",
     "steps_per_second",
+    "normalised",
+    "normalised_low",
+    "normalised_high",
+    "normalised_iqm",
+    "normalised_iqm_low",
+    "normalised_iqm_high",
+    "each_seed_normalised",
+    "random",
 )
 
 
@@ -57,10 +65,23 @@ def with_interval(estimate: Estimate, digits: int = 1) -> str:
         >>> with_interval(Estimate(20.0, 10.0, 30.0)), with_interval(Estimate(20.0, None, None))
         ('20.0 [10.0, 30.0]', '20.0')
     """
-    text = f"{estimate.value:,.{digits}f}"
+    text = f"{estimate.value:z,.{digits}f}"
     if estimate.low is None or estimate.high is None:
         return text
-    return f"{text} [{estimate.low:,.{digits}f}, {estimate.high:,.{digits}f}]"
+    return f"{text} [{estimate.low:z,.{digits}f}, {estimate.high:z,.{digits}f}]"
+
+
+def reference_text(values: Sequence[float]) -> str:
+    """A score to compare with; the mean, and the range, where seeds have their own.
+
+    Examples:
+        >>> reference_text([900.0]), reference_text([900.0, 1000.0])
+        ('900.0', '950.0 (mean of 2, 900.0 to 1,000.0)')
+    """
+    mean = number(sum(values) / len(values))
+    if len(values) == 1:
+        return mean
+    return f"{mean} (mean of {len(values)}, {number(min(values))} to {number(max(values))})"
 
 
 def steps_text(row: Row) -> str:
@@ -101,32 +122,34 @@ def budget_text(rows: Iterable[Row]) -> str:
 
 
 def markdown(table: Table) -> str:
-    """The table as Markdown, without its caption; games have life length and speed besides."""
-    varied = table.name != "results"
-    lives = any(line.row.life_length is not None for line in table.lines)
-    head = ["method", *(["setting"] if varied else []), "n", "steps", "mean [95%]", "IQM [95%]"]
-    head += ["mode", "P(> best control) [95%]", "paper"]
-    head += [*(["life length", "steps/s"] if lives else []), "each seed"]
-    cells = [head, ["---"] * len(head)]
+    """The table as Markdown, without its caption.
+
+    The best of the methods that imitate is in bold. A column in which no line has anything is left
+    out. All else that is known of a row is in the CSV.
+    """
+    best = table.best
+    columns: dict[str, list[str]] = {}
     for line in table.lines:
         row = line.row
-        mean, middle = row.estimates
-        cells.append(
-            [
-                row.name,
-                *([line.value] if varied else []),
-                str(len(row.runs)),
-                steps_text(row),
-                with_interval(mean),
-                with_interval(middle),
-                number(row.mode_mean),
-                with_interval(line.improvement[0], 2) if line.improvement else "-",
-                number(line.paper.value if line.paper else None),
-                *([number(row.life_length), number(row.speed)] if lives else []),
-                " ".join(number(score) for score in row.scores),
-            ]
-        )
-    return "\n".join(f"| {' | '.join(row)} |" for row in cells) + "\n"
+        bold = "**{}**" if line in best else "{}"
+        values = {
+            "method": bold.format(row.name),
+            "setting": line.value,
+            "n": str(len(row.runs)),
+            "steps": steps_text(row),
+            "score [95%]": bold.format(with_interval(row.estimates[0])),
+            "normalised [95%]": with_interval(line.normalised[0], 2) if line.normalised else "",
+            "P(> best control) [95%]": (
+                with_interval(line.improvement[0], 2) if line.improvement else ""
+            ),
+            "paper": number(line.paper.value) if line.paper else "",
+            "each seed": " ".join(number(score) for score in row.scores),
+        }
+        for name, value in values.items():
+            columns.setdefault(name, []).append(value.replace("|", "\\|"))
+    kept = {name: values for name, values in columns.items() if any(values)}
+    rows = [list(kept), ["---"] * len(kept), *zip(*kept.values(), strict=True)]
+    return "".join(f"| {' | '.join(value or '-' for value in row)} |\n" for row in rows)
 
 
 def to_csv(tables: Sequence[Table]) -> str:
@@ -159,4 +182,8 @@ def _cells(table: Table, line: Line) -> list[Any]:
         panel.reference("expert"),
         row.life_length,
         row.speed,
+        *(line.normalised[0] if line.normalised else (None, None, None)),
+        *(line.normalised[1] if line.normalised else (None, None, None)),
+        " ".join(map(str, panel.normalised(row))),
+        panel.scale.random,
     ]

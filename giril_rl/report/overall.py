@@ -1,4 +1,4 @@
-"""All tasks together: scores in units of the demonstration's, seeds resampled within each task."""
+"""All tasks together: normalised scores, seeds resampled within each task."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from giril_rl.report.bars import comparable
-from giril_rl.report.formats import budget_text, with_interval
+from giril_rl.report.formats import budget_text, number, with_interval
 from giril_rl.report.rows import Panel, Row
 from giril_rl.report.statistics import mean_and_iqm
 
@@ -18,40 +18,49 @@ def overall(panels: Sequence[Panel]) -> str:
     A method stands in it that was run on every task, with the seeds that it has on each of them.
 
     Args:
-        panels: the tasks; one whose demonstration has no positive score is left out.
+        panels: the tasks; one without normalised scores is left out.
     """
     found = comparable(panels)
     if len(found) < 2:
         return ""
-    names = list(dict.fromkeys(row.name for _, _, rows in found for row in rows))
+    kinds = {(row.method, row.profile): row for _, rows in found for row in rows}
     lines, missing = [], []
-    for name in names:
-        rows = [(score, row) for _, score, rows in found for row in rows if row.name == name]
+    for kind, first in kinds.items():
+        rows = [
+            (panel, row)
+            for panel, rows in found
+            for row in rows
+            if (row.method, row.profile) == kind
+        ]
         seeds = _common_seeds([row for _, row in rows])
         if len(rows) < len(found) or not seeds:
-            missing.append(name)
+            missing.append(first.name)
             continue
-        scores = np.array(
-            [[row.scores[row.seeds.index(seed)] / score for score, row in rows] for seed in seeds]
-        )
-        mean, middle = mean_and_iqm(scores)
-        lines.append(
-            f"| {name} | {len(seeds)} | {with_interval(mean, 2)} | {with_interval(middle, 2)} |"
-        )
+        columns = [dict(zip(row.seeds, panel.normalised(row), strict=True)) for panel, row in rows]
+        scores = np.array([[column[seed] for column in columns] for seed in seeds])
+        lines.append((first, len(seeds), *mean_and_iqm(scores)))
     if not lines:
         return ""
     tasks = "; ".join(
-        f"{panel.title} ({panel.demonstration} {score:,.1f}, {budget_text(rows)})"
-        for panel, score, rows in found
+        f"{panel.title} (random policy {number(panel.scale.random)}, player "
+        f"{number(panel.reference('expert'))}, {budget_text(rows)})"
+        for panel, rows in found
     )
     text = (
-        f"Scores divided by the demonstration's, over {len(found)} tasks: {tasks}. `n` is the "
-        "number of seeds on each task.\n"
+        f"Normalised scores over {len(found)} tasks: {tasks}. `n` is the number of seeds on each "
+        "task.\n"
     )
     if missing:
         text += f"Not on every task, and so not here: {', '.join(missing)}.\n"
-    head = "| method | n | mean [95%] | IQM [95%] |\n|---|---|---|---|\n"
-    return f"{text}\n{head}" + "\n".join(lines) + "\n"
+    learned = [mean.value for row, _, mean, _ in lines if row.is_learned]
+    best = max(learned) if len(learned) > 1 else None
+    head = "| method | n | normalised [95%] | IQM [95%] |\n|---|---|---|---|\n"
+    return f"{text}\n{head}" + "".join(
+        f"| {bold.format(row.name)} | {count} | {bold.format(with_interval(mean, 2))} "
+        f"| {with_interval(middle, 2)} |\n"
+        for row, count, mean, middle in lines
+        for bold in ["**{}**" if row.is_learned and mean.value == best else "{}"]
+    )
 
 
 def _common_seeds(rows: Sequence[Row]) -> list[int]:

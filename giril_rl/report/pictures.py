@@ -9,12 +9,15 @@ from pathlib import Path
 from giril_rl.configs import DemoConfig
 from giril_rl.demos import Demonstration
 from giril_rl.errors import UserError
+from giril_rl.files import read_json
 from giril_rl.naming import safe
+from giril_rl.pretrained import CARD
 from giril_rl.report.game import GAMES, MOST_STEPS, typical_game
 from giril_rl.report.game_reward import draw_game, rewards_of
 from giril_rl.report.predictions import Shown, draw_predictions, foresee, spread
 from giril_rl.report.rows import Panel, Row
 from giril_rl.report.runs import RunRecord
+from giril_rl.report.style import is_own
 from giril_rl.rewards import GenerativeReward
 from giril_rl.training.agent import load_agent
 from giril_rl.training.finished import read_config, read_part, read_settings
@@ -45,10 +48,22 @@ def draw_pictures(panels: Sequence[Panel], out: Path) -> list[str]:
     """
     sections = []
     for panel in panels:
-        rows = [row for row in panel.rows if row.method in GENERATIVE and row.runs[0].is_atari]
+        rows = [row for row in panel.rows if row.runs[0].is_atari and _is_generative(row)]
         if rows:
             sections.append(_section(panel, rows, out))
     return sections
+
+
+def _is_generative(row: Row) -> bool:
+    """Whether the reward is a generative model's error; of a user's own recipe, its card tells."""
+    card = row.runs[0].folder / REWARD / CARD
+    if not is_own(row.method) or not card.is_file():
+        return row.method in GENERATIVE
+    try:
+        made_by = read_json(card).get("made_by")
+    except UserError:
+        return True  # Where it is loaded, it is said what is wrong with it.
+    return isinstance(made_by, dict) and made_by.get("class") == GenerativeReward.__name__
 
 
 def _section(panel: Panel, rows: Sequence[Row], out: Path) -> str:
@@ -140,7 +155,7 @@ def _foresee_demonstration(
         labels = [f"game {e + 1}\n{label}" for e, label in zip(episodes, labels, strict=True)]
     title = f"demonstration, {len(demo):,} transitions"
     every = read_part(run.folder, read_config(run.folder), "demo", DemoConfig).subsample
-    if (run.result or {}).get("method") != UNTRAINED and every > 1:
+    if run.method != UNTRAINED and every > 1:
         title += f", of which the model was fitted to 1 in {every}"
         labels = [
             f"{label}\n{'not ' if index % every else ''}fitted"

@@ -10,7 +10,16 @@ from giril_rl.naming import safe
 from giril_rl.places import check_place
 from giril_rl.report.bars import draw_bars
 from giril_rl.report.curves import draw_results, draw_varied
-from giril_rl.report.formats import budget_text, markdown, seeds_text, steps_text, to_csv
+from giril_rl.report.formats import (
+    budget_text,
+    markdown,
+    reference_text,
+    seeds_text,
+    steps_text,
+    to_csv,
+)
+from giril_rl.report.normalised import what_is_missing
+from giril_rl.report.origins import intervals_text, made_with
 from giril_rl.report.overall import overall
 from giril_rl.report.pictures import draw_pictures
 from giril_rl.report.rows import Panel, panels_of
@@ -35,6 +44,11 @@ _RUN_COLUMNS = (
     "steps_per_second",
     "config_hash",
     "last_line",
+    "demo",
+    "demo_id",
+    "expert_return_mean",
+    "demo_return_mean",
+    "normalised",
 )
 
 
@@ -60,16 +74,14 @@ def write_report(folder: Path, out: Path) -> str:
     bars = draw_bars(panels, out / "normalised.png")
     sections = [_head(runs, unfinished)]
     if bars:
-        sections.append(
-            "## All tasks\n\n![scores normalised to the demonstration](normalised.png)\n"
-        )
+        sections.append("## All tasks\n\n![normalised scores](normalised.png)\n")
         sections.append(overall(panels))
     sections += [_section(table, out) for table in tables]
     sections += draw_pictures(panels, out)
     sections += [_leftovers(panels), _without_result(unfinished)]
     write_atomically(out / "report.md", "\n".join(text for text in sections if text))
     write_atomically(out / "results.csv", to_csv(tables))
-    write_atomically(out / "runs.csv", _runs_csv(runs, unfinished))
+    write_atomically(out / "runs.csv", _runs_csv(runs, unfinished, panels))
     missing = f", {len(unfinished)} without a result" if unfinished else ""
     return f"{len(runs)} finished runs in {len(tables)} tables{missing}: {out / 'report.md'}"
 
@@ -83,17 +95,22 @@ def _head(runs: Sequence[RunRecord], unfinished: Sequence[Unfinished]) -> str:
     )
     return (
         "# Results\n\n"
-        f"{len(runs)} finished runs.{missing} A score is the task's own return, the mean over "
-        f"{' or '.join(map(str, episodes))} whole episodes on fresh environments: of the policy as "
-        "trained, which samples its actions, and under `mode` of the same policy playing its most "
-        "likely action. `n` is the number of seeds, `steps` what the policy trained for. Intervals "
-        f"are 95% stratified bootstrap intervals over seeds (rliable, {RESAMPLES:,} resamples); "
-        "with few seeds they are too narrow: read the seeds. IQM is the interquartile mean. "
-        "`P(> best control)` is the probability that a run of the method scores above a run of the "
-        "control with the highest mean on that task at that budget, a draw counting one half; that "
-        "control was chosen by these same runs. `paper` is the paper's mean. For games, `life "
-        "length` is agent steps for each life and `steps/s` what the policy's training made of the "
-        "machine, shared with whatever ran beside it.\n"
+        f"{len(runs)} finished runs, made with {made_with(runs)}.{missing}\n\n"
+        f"- **score**: the task's own return, the mean over {' or '.join(map(str, episodes))} "
+        "whole episodes on fresh environments. The policy samples its actions, as in training. "
+        "`n` is the number of seeds, `steps` what the policy trained for.\n"
+        "- **normalised**: (score - random) / (player - random). 0 is the mean score of a random "
+        "policy on that task, 1 that of the player whose demonstration the run learned from. A run "
+        "without a demonstration has the player of its seed.\n"
+        "- **[low, high]**: 95% stratified bootstrap interval over seeds (rliable, "
+        f"{RESAMPLES:,} resamples). With few seeds it is too narrow: read the seeds. The random "
+        "policy's score counts as known.\n"
+        "- **P(> best control)**: probability that a run of the method scores above a run of the "
+        "control with the highest mean on that task at that budget; a draw counts one half. The "
+        "control was chosen by these same runs.\n"
+        "- **paper**: the paper's mean score. **Bold**: the best of the methods that imitate.\n\n"
+        "Interquartile means, scores of each policy's most likely action, life lengths and speeds "
+        "are in [results.csv](results.csv), all runs in [runs.csv](runs.csv).\n"
     )
 
 
@@ -115,17 +132,24 @@ def _section(table: Table, out: Path) -> str:
 
 def _caption(table: Table) -> str:
     panel, rows = table.panel, [line.row for line in table.lines]
-    parts = [f"{seeds_text(rows)}, {budget_text(rows)}."]
+    parts = [f"{seeds_text(rows)}, {budget_text(rows)}.", intervals_text(table)]
+    random = panel.scale.random
     references = [
-        f"{words} {value:,.1f}"
-        for words, value in (
-            (panel.demonstration, panel.reference("demo")),
-            ("expert", panel.reference("expert")),
+        f"{words} {reference_text(values)}"
+        for words, values in (
+            (panel.demonstration, panel.references("demo")),
+            ("expert", panel.references("expert")),
+            ("random policy", [] if random is None else [random]),
         )
-        if value is not None
+        if values
     ]
     if references:
-        parts.append(f"Scores of the {' and of the '.join(references)}.")
+        words = " and of the ".join(
+            filter(None, [", of the ".join(references[:-1]), references[-1]])
+        )
+        parts.append(f"Scores of the {words}.")
+    if table.name == "results" or not panel.main:
+        parts.append(what_is_missing(panel))
     controls = [line.improvement[1] for line in table.lines if line.improvement]
     if controls:
         names = {f"{row.name.removeprefix('control: ')} ({steps_text(row)})" for row in controls}
@@ -138,7 +162,7 @@ def _caption(table: Table) -> str:
         parts.append(f"All runs have `{shared}`.")
     if any(key == "task.horizon" for key, _ in panel.changes):
         parts.append("Curves are of training episodes; scores are of episodes that a failure ends.")
-    return " ".join(parts) + "\n"
+    return " ".join(part for part in parts if part) + "\n"
 
 
 def _leftovers(panels: Sequence[Panel]) -> str:
@@ -161,12 +185,20 @@ def _without_result(unfinished: Sequence[Unfinished]) -> str:
     return "## Without a result\n\n" + "\n".join(lines) + "\n"
 
 
-def _runs_csv(runs: Sequence[RunRecord], unfinished: Sequence[Unfinished]) -> str:
+def _runs_csv(
+    runs: Sequence[RunRecord], unfinished: Sequence[Unfinished], panels: Sequence[Panel]
+) -> str:
+    scales = {
+        run.name: panel.scale
+        for panel in panels
+        for run in (*(run for row in panel.rows for run in row.runs), *panel.repeats)
+    }
     rows = []
     for run in runs:
         result = run.result or {}
         row = {key: result.get(key) for key in _RUN_COLUMNS}
-        row["folder"], row["state"] = run.name, "finished"
+        row["folder"], row["state"], row["method"] = run.name, "finished", run.method
+        row["normalised"] = scales[run.name].of_run(run)
         row["reward_seed"] = result.get("seeds", {}).get("reward")
         row["mode_return_mean"] = (result.get("deterministic") or {}).get("return_mean")
         rows.append(row)

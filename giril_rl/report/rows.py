@@ -8,18 +8,20 @@ from functools import cached_property
 from typing import Any
 
 from giril_rl.report.ablations import ABLATION_KEYS
+from giril_rl.report.normalised import Scale, by_seed
 from giril_rl.report.paper import paper_figure
 from giril_rl.report.runs import RunRecord
 from giril_rl.report.settings import (
     Changes,
     changes_of,
     method_of,
+    profile_of,
     shared_changes,
     split_task,
-    uses_profile,
 )
 from giril_rl.report.statistics import Estimate, mean_and_iqm
-from giril_rl.report.style import CONTROL, method_name, rank
+from giril_rl.report.style import CONTROL, TRUE_REWARD, Look, is_own, look, method_name, rank
+from giril_rl.training.random_policy import RANDOM
 
 
 @dataclass
@@ -27,11 +29,12 @@ class Row:
     """One method with one setting and budget on one task.
 
     Attributes:
-        method: as ``result.json`` names it.
+        method: as :func:`giril_rl.report.settings.method_of` names it.
         profile: None where it makes no difference.
         changes: settings that differ from the recipe's own, less those of the whole panel.
         steps: the budget that the runs were given.
         runs: its runs, by seed.
+        number: of a recipe of the user's own, its place among all of them in the report.
     """
 
     method: str
@@ -39,6 +42,7 @@ class Row:
     changes: Changes
     steps: int
     runs: list[RunRecord] = field(default_factory=list)
+    number: int = 0
 
     @property
     def name(self) -> str:
@@ -49,6 +53,16 @@ class Row:
     def is_control(self) -> bool:
         """Whether nothing of the row was learned from a demonstration's actions."""
         return self.method.startswith(CONTROL)
+
+    @property
+    def is_learned(self) -> bool:
+        """Whether it is of a method that imitates: no control, and nothing on the true reward."""
+        return not self.is_control and self.method not in ("expert", TRUE_REWARD)
+
+    @property
+    def look(self) -> Look:
+        """How it is drawn."""
+        return look(self.method, self.profile, self.number)
 
     @property
     def settings(self) -> str:
@@ -137,10 +151,11 @@ def longest(rows: Iterable[Row]) -> list[Row]:
         >>> [row.steps for row in longest([Row("bc", None, (), 10), Row("bc", None, (), 20)])]
         [20]
     """
-    found: dict[str, Row] = {}
+    found: dict[tuple[str, str | None], Row] = {}
     for row in rows:
-        if row.method != "expert" and (row.name not in found or row.steps > found[row.name].steps):
-            found[row.name] = row
+        key = row.method, row.profile
+        if row.method != "expert" and (key not in found or row.steps > found[key].steps):
+            found[key] = row
     return list(found.values())
 
 
@@ -185,14 +200,35 @@ class Panel:
         atari = any(run.is_atari for run in runs)
         return "demonstration of one life" if atari and lives == {"first"} else "demonstration"
 
+    @cached_property
+    def scale(self) -> Scale:
+        """What scores are normalised by."""
+        random = [score for row in self.rows if row.method == RANDOM for score in row.scores]
+        every = [run for row in self.rows for run in row.runs]
+        players = by_seed(every, "expert_return_mean") | self._main_by_seed("expert")
+        return Scale(_mean(random), players)
+
+    def references(self, who: str) -> list[float]:
+        """Mean return of each seed's ``expert`` or ``demo``, of the main rows if they have any.
+
+        One value where all seeds have the same.
+        """
+        found = list(self._main_by_seed(who).values())
+        if not found:
+            every = [run for row in self.rows for run in row.runs]
+            found = list(by_seed(every, f"{who}_return_mean").values())
+        return found[:1] if len(set(found)) == 1 else found
+
+    def _main_by_seed(self, who: str) -> dict[int, float]:
+        return by_seed([run for row in self.main for run in row.runs], f"{who}_return_mean")
+
     def reference(self, who: str) -> float | None:
-        """Mean return of the ``expert`` or the ``demo`` that most runs have; main rows first."""
-        key = f"{who}_return_mean"
-        for rows in (self.main, self.rows):
-            found = [r[key] for row in rows for r in row.results if r.get(key) is not None]
-            if found:
-                return float(max(found, key=found.count))
-        return None
+        """Mean over seeds of :meth:`references`; None where there are none."""
+        return _mean(self.references(who))
+
+    def normalised(self, row: Row) -> list[float]:
+        """A row's scores between a random policy's and each run's player's; empty without them."""
+        return self.scale.of_runs(row.runs)
 
     def best_control(self, row: Row) -> Row | None:
         """The control with the highest mean at a row's budget, with its recipe's own settings.
@@ -212,6 +248,7 @@ class Panel:
 def panels_of(runs: Sequence[RunRecord]) -> list[Panel]:
     """Groups finished runs into rows, and rows into panels by their task."""
     changes = changes_of(runs)
+    own = sorted({method for run in runs if is_own(method := method_of(run))})
     tasks: dict[tuple[str, Changes], list[RunRecord]] = {}
     for run in runs:
         # An expert is trained on the task's own horizon, and belongs to it.
@@ -219,21 +256,26 @@ def panels_of(runs: Sequence[RunRecord]) -> list[Panel]:
         tasks.setdefault(key, []).append(run)
     # The paper's tasks come first.
     order = sorted(tasks, key=lambda key: (not paper_figure("results", key[0], "giril"), *key))
-    return [_panel(*key, tasks[key], changes) for key in order]
+    return [_panel(*key, tasks[key], changes, own) for key in order]
 
 
 def _panel(
-    task: str, of_task: Changes, runs: Sequence[RunRecord], changes: dict[str, Changes]
+    task: str,
+    of_task: Changes,
+    runs: Sequence[RunRecord],
+    changes: dict[str, Changes],
+    own: Sequence[str],
 ) -> Panel:
     others = {run.name: split_task(changes[run.name])[1] for run in runs}
     shared = shared_changes(runs, others, ABLATION_KEYS)
     rows: dict[tuple[Any, ...], Row] = {}
     repeats = []
     for run in runs:
-        own = tuple(change for change in others[run.name] if change not in shared)
-        profile = str(run.config.get("profile")) if uses_profile(run) else None
-        key = (method_of(run), profile, own, run.steps)
-        row = rows.setdefault(key, Row(*key))
+        method = method_of(run)
+        differing = tuple(change for change in others[run.name] if change not in shared)
+        number = own.index(method) if method in own else 0
+        key = (method, profile_of(run), differing, run.steps)
+        row = rows.setdefault(key, Row(*key, number=number))
         if run.seed in row.seeds:
             repeats.append(run)
         else:

@@ -41,6 +41,18 @@ class RunRecord:
         return str(self.config["recipe"])
 
     @property
+    def method(self) -> str:
+        """The recipe's name, whatever its result says; a control's with its reward."""
+        if self.recipe != "control":
+            return self.recipe
+        return str((self.result or {}).get("method", f"control:{self.config.get('reward')}"))
+
+    @property
+    def score(self) -> float | None:
+        """Mean return of the policy as trained; None for an unfinished run."""
+        return None if self.result is None else float(self.result["return_mean"])
+
+    @property
     def seed(self) -> int:
         """The seed of the policy's training."""
         return int(self.config["seed"])

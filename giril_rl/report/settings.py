@@ -12,39 +12,60 @@ from typing import Any
 from giril_rl.errors import UserError
 from giril_rl.naming import NO_EFFECT
 from giril_rl.report.runs import RunRecord
+from giril_rl.report.style import TRUE_REWARD, is_own
 from giril_rl.schema import flat
 
-TRUE_REWARD = "true_reward"
-"""A run of the recipe ``expert`` that takes its whole budget, as the methods beside it do."""
 WITHOUT_PROFILE = frozenset(
     {"expert", TRUE_REWARD, "gail", "vail", "bc", "control:random", "control:held_action"}
 )
 """Methods that never average rewards over environments, so that both profiles are one run."""
-_NOT_FITTED = frozenset(
-    f"control:{name}"
-    for name in ("constant", "copy", "untrained_giril", "untrained_icm", "random", "held_action")
-)
-# A control's `reward` is a part of its method's name.
-_IDENTITY = NO_EFFECT | {"recipe", "seed", "steps", "task.name", "task.steps", "profile", "reward"}
+_OF_REWARDS = ("fit.", "demo.", "expert.", "giril.", "icm.")
+_NOT_READ: dict[str, tuple[str, ...]] = {
+    "control:constant": _OF_REWARDS,
+    "control:copy": ("fit.", "icm."),
+    "control:untrained_giril": ("fit.", "icm."),
+    "control:untrained_icm": ("fit.", "giril."),
+    "control:random": (*_OF_REWARDS, "ppo.", "scaling."),
+    "control:held_action": (*_OF_REWARDS, "ppo.", "scaling."),
+}
+"""Settings that a control has and does not use, by how their keys begin."""
+# What rows and panels are told apart by, and not by a change of settings.
+_IDENTITY = NO_EFFECT | {"recipe", "seed", "steps", "task.name", "task.steps"}
+_IDENTITY |= {"profile", "batch_mean"}
 Changes = tuple[tuple[str, str], ...]
 """``(key, value as text)`` of the settings that are not the recipe's own, by key."""
 
 
 @cache
 def _defaults(recipe: str, task: str, env_id: str) -> dict[str, Any] | None:
-    """A shipped recipe's own settings on a task, flat; None where there is no such recipe."""
-    from giril_rl.compose import groups, resolved
+    """A shipped recipe's own settings on a task, flat; None where there is no such recipe.
+
+    A run that somebody sent may name any file, which is not to be run.
+    """
+    from giril_rl.compose import resolved
     from giril_rl.recipe_config import config_class
-    from giril_rl.recipes import find
+    from giril_rl.recipes import shipped
 
     try:
-        found = find(recipe)
-        shipped = task in groups(found)["task"][0]
-        text = f"task={task}" if shipped else f"task.env_id={env_id}"
-        config = resolved(found, config_class(found), [text])[0]
+        found = {each.name: each for each in shipped()}[recipe]
+        config = resolved(found, config_class(found), [_task_word(task, env_id)])[0]
     except (UserError, KeyError):
         return None
     return flat(json.loads(json.dumps(asdict(config))))
+
+
+@cache
+def _task_word(task: str, env_id: str) -> str:
+    from giril_rl.compose import groups
+    from giril_rl.recipes import find
+
+    known = task in groups(find("control"))["task"][0]
+    return f"task={task}" if known else f"task.env_id={env_id}"
+
+
+def task_word(run: RunRecord) -> str:
+    """How a run's task is named on the command line."""
+    return _task_word(str(run.config["task.name"]), str(run.config.get("task.env_id")))
 
 
 def text_of(value: Any) -> str:
@@ -75,41 +96,50 @@ def changes_of(runs: Sequence[RunRecord]) -> dict[str, Changes]:
             for key, value in run.config.items()
             if key not in _IDENTITY
             and _reads(run, key)
-            and not _averaging_follows(run, key, value)
             and not (key in base and base[key] == value)
         }
+        # Asking for another player or recording is asking for none that is shipped.
+        if differing.get("demo.path") == "null" and any(map(_of_players, differing)):
+            del differing["demo.path"]
         found[run.name] = tuple(sorted(differing.items()))
     return found
+
+
+def _of_players(key: str) -> bool:
+    recorded = key.startswith("demo.") and key not in ("demo.path", "demo.subsample")
+    return recorded or key.startswith("expert.")
 
 
 def _reads(run: RunRecord, key: str) -> bool:
     """Whether a setting tells the run from others of its method.
 
-    A control may have nothing to fit, and what stops early is called otherwise.
+    What stops early is called otherwise, and a control's reward is a part of its name.
     """
     method = method_of(run)
     if key == "stop_early":
         return method != TRUE_REWARD
-    return not (key.startswith("fit.") and method in _NOT_FITTED)
+    if key == "reward":
+        return run.recipe != "control"
+    return not key.startswith(_NOT_READ.get(method, ()))
 
 
-def _averaging_follows(run: RunRecord, key: str, value: Any) -> bool:
-    """Whether ``batch_mean`` is only what the profile says."""
-    if key != "batch_mean":
-        return False
-    return not uses_profile(run) or value == (run.config.get("profile") == "released")
+def profile_of(run: RunRecord) -> str | None:
+    """``released`` if rewards were averaged over environments, else ``paper``.
 
-
-def uses_profile(run: RunRecord) -> bool:
-    """Whether the profile makes a difference to the run's method."""
-    return method_of(run) not in WITHOUT_PROFILE
+    None for what averages nothing in either profile: the shipped recipes that are known for it, and
+    runs whose result says so.
+    """
+    no_difference = (run.result or {}).get("profile", "unknown") is None
+    if no_difference or method_of(run) in WITHOUT_PROFILE:
+        return None
+    averaged = run.config.get("batch_mean", run.config.get("profile") == "released")
+    return "released" if averaged else "paper"
 
 
 def method_of(run: RunRecord) -> str:
-    """The method's name: the result's, else the recipe's; an expert may be one to compare with."""
-    method = str((run.result or {}).get("method", run.recipe))
-    whole = method == "expert" and run.config.get("stop_early") is False
-    return TRUE_REWARD if whole else method
+    """The run's method; an expert that takes its whole budget is one to compare with."""
+    whole = run.method == "expert" and run.config.get("stop_early") is False
+    return TRUE_REWARD if whole else run.method
 
 
 def _usual(runs: Iterable[RunRecord]) -> dict[tuple[str, str], dict[str, Any]]:
@@ -145,7 +175,8 @@ def shared_changes(
 ) -> Changes:
     """Changes that all runs of one task have in common: the study's own settings, no row's.
 
-    A key counts where runs of at least two methods have it and all that have it agree.
+    A key counts where runs of at least two methods have it and all that have it agree. What a
+    recipe of the user's own has usually is no change of it, and agrees as well.
 
     Args:
         runs: runs of one task.
@@ -161,6 +192,11 @@ def shared_changes(
             if change[0] in run.config and _reads(run, change[0]) and method_of(run) != "expert"
         ]
         methods = {method_of(run) for run in having}
-        if len(methods) > 1 and all(change in changes[run.name] for run in having):
+        agree = (
+            change in changes[run.name]
+            or (is_own(run.method) and text_of(run.config[change[0]]) == change[1])
+            for run in having
+        )
+        if len(methods) > 1 and all(agree):
             found.append(change)
     return tuple(found)

@@ -9,7 +9,7 @@ from functools import cached_property
 from giril_rl.report.ablations import ABLATIONS, Ablation
 from giril_rl.report.paper import Figure, paper_figure
 from giril_rl.report.rows import Panel, Row
-from giril_rl.report.statistics import Estimate, probability_of_improvement
+from giril_rl.report.statistics import Estimate, mean_and_iqm, probability_of_improvement
 
 
 @dataclass
@@ -27,6 +27,12 @@ class Line:
     row: Row
     value: str
     paper: Figure | None
+
+    @cached_property
+    def normalised(self) -> tuple[Estimate, Estimate] | None:
+        """Mean and interquartile mean of the row's normalised scores."""
+        scores = self.panel.normalised(self.row)
+        return mean_and_iqm(scores) if scores else None
 
     @cached_property
     def improvement(self) -> tuple[Estimate, Row] | None:
@@ -52,6 +58,18 @@ class Table:
     title: str
     panel: Panel
     lines: list[Line]
+
+    @property
+    def best(self) -> list[Line]:
+        """Of two or more lines of methods that imitate, the best; more than one where they tie."""
+        scores = {
+            id(line): round(line.row.estimates[0].value, 1)
+            for line in self.lines
+            if line.row.is_learned
+        }
+        if len(set(scores.values())) < 2:
+            return []
+        return [line for line in self.lines if scores.get(id(line)) == max(scores.values())]
 
 
 def tables_of(panel: Panel) -> list[Table]:

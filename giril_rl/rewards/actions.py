@@ -4,19 +4,10 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor, nn
-from torchrl.data import (
-    Binary,
-    Bounded,
-    Categorical,
-    Composite,
-    MultiCategorical,
-    MultiOneHot,
-    OneHot,
-    TensorSpec,
-    Unbounded,
-)
+from torchrl.data import Categorical, OneHot, TensorSpec
 
 from giril_rl.errors import UserError
+from giril_rl.networks.action_bounds import affine_map, single_action_spec
 
 
 class ActionEncoder(nn.Module):
@@ -36,6 +27,7 @@ class ActionEncoder(nn.Module):
             their dtype and shape are looked at, so that the encoder can be recorded as a graph.
 
     Examples:
+        >>> from torchrl.data import Bounded
         >>> ActionEncoder(Categorical(3))(torch.tensor([2, 0])).tolist()
         [[0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]
         >>> ActionEncoder(Bounded(0.0, 4.0, shape=(1,)))(torch.tensor([[3.0], [9.0]])).tolist()
@@ -49,34 +41,15 @@ class ActionEncoder(nn.Module):
 
     def __init__(self, spec: TensorSpec) -> None:
         super().__init__()
-        while isinstance(spec, Composite) and len(spec.keys()) == 1:
-            spec = next(iter(spec.values()))
+        spec = single_action_spec(spec)
         self.discrete = isinstance(spec, (Categorical, OneHot))
         self.one_hot = isinstance(spec, OneHot)
-        self.size = 0
-        if isinstance(spec, (MultiCategorical, MultiOneHot, Binary, Composite)):
-            raise _unsupported(spec)
-        if isinstance(spec, (Categorical, OneHot)):
-            self.size = int(spec.space.n)
+        self.size = int(spec.space.n if self.discrete else spec.shape[-1])
+        if self.discrete:
             return
-        continuous = isinstance(spec, (Bounded, Unbounded)) and spec.dtype.is_floating_point
-        if not continuous or not spec.shape:
-            raise _unsupported(spec)
-        self.size = spec.shape[-1]
-        low, high = (
-            bound.reshape(-1, self.size).to(device="cpu", dtype=torch.float64)
-            for bound in (spec.space.low, spec.space.high)
-        )
-        if (low != low[0]).any() or (high != high[0]).any():
-            raise UserError("the action bounds differ between environments: give them equal ones.")
-        # TorchRL writes "no bound" as the largest number of the dtype.
-        limit = torch.finfo(spec.dtype).max
-        low = torch.where(low[0] <= -limit, -torch.inf, low[0])
-        high = torch.where(high[0] >= limit, torch.inf, high[0])
-        bounded = low.isfinite() & high.isfinite() & (high > low)
-        offset = torch.where(bounded, (low + high) / 2, 0.0)
-        scale = torch.where(bounded, 2 / (high - low), 1.0)
-        for name, value in {"low": low, "high": high, "offset": offset, "scale": scale}.items():
+        low, high, offset, half_range = affine_map(spec)
+        buffers = {"low": low, "high": high, "offset": offset, "scale": 1 / half_range}
+        for name, value in buffers.items():
             self.register_buffer(name, value.to(torch.get_default_dtype()))
 
     @property
@@ -169,10 +142,3 @@ class ActionEncoder(nn.Module):
     def extra_repr(self) -> str:
         """Shows kind and size when printed."""
         return f"{'discrete' if self.discrete else 'box'}, size={self.size}"
-
-
-def _unsupported(spec: TensorSpec) -> UserError:
-    return UserError(
-        f"an action spec of the kind {type(spec).__name__} with shape {tuple(spec.shape)} is not "
-        "supported: give a single Categorical, OneHot or one-dimensional Bounded or Unbounded one."
-    )

@@ -32,15 +32,11 @@ def feature_error(predicted: Tensor, features: Tensor) -> Tensor:
         predicted: the forward model's ``phi_hat(s')``, ``(*batch, features)``.
         features: ``phi(s')``, of the same shape.
 
-    Raises:
-        UserError: if it is of another shape.
-
     Examples:
         >>> import torch
         >>> feature_error(torch.tensor([[0.5, 1.0]]), torch.tensor([[0.5, -1.0]]))
         tensor([4.])
     """
-    check_output("the forward model", predicted, features.shape)
     return (predicted - features).square().sum(-1)
 
 
@@ -208,6 +204,12 @@ class CuriosityReward(Pretrained, TensorDictModuleBase):
         """``phi_hat(s')`` from ``phi(s)`` and the action's code."""
         return self.forward_model(features, action_code)
 
+    def forward_error(self, features: Tensor, action_code: Tensor, next_features: Tensor) -> Tensor:
+        """:func:`feature_error` of :meth:`predict`, whose shape is checked."""
+        predicted = self.predict(features, action_code)
+        check_output("the forward model", predicted, next_features.shape)
+        return feature_error(predicted, next_features)
+
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes each transition's reward."""
@@ -219,4 +221,4 @@ class CuriosityReward(Pretrained, TensorDictModuleBase):
     def _error(self, observation: Tensor, action: Tensor, following: Tensor) -> Tensor:
         features = self.features(self.scaler(observation))
         next_features = self.features(self.scaler(following))
-        return feature_error(self.predict(features, self.actions(action)), next_features)
+        return self.forward_error(features, self.actions(action), next_features)

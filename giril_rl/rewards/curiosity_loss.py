@@ -8,7 +8,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 
 from giril_rl.errors import UserError
-from giril_rl.rewards.curiosity import CuriosityReward, feature_error
+from giril_rl.rewards.curiosity import CuriosityReward
 from giril_rl.rewards.generative_loss import action_term
 from giril_rl.rewards.transition_loss import Reduction, TransitionLoss
 from giril_rl.rewards.transitions import check_transitions
@@ -86,5 +86,4 @@ class CuriosityRewardLoss(TransitionLoss):
         inverse = action_term(reward.invert(phi, next_phi), reward.actions.target(action))
         if self.features == "inverse":
             phi, next_phi = phi.detach(), next_phi.detach()
-        error = feature_error(reward.predict(phi, reward.actions(action)), next_phi)
-        return inverse, error
+        return inverse, reward.forward_error(phi, reward.actions(action), next_phi)

@@ -4,14 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from omegaconf import OmegaConf
+
+from giril_rl.compose import compose, groups
 from giril_rl.configs import ExpertRunConfig
 from giril_rl.errors import UserError
-from giril_rl.naming import config_hash, out_folder
+from giril_rl.files import read_json
+from giril_rl.imports import check_found, modules_of, named_modules
+from giril_rl.jobs import Jobs
+from giril_rl.naming import config_hash, is_scored_as, out_folder
+from giril_rl.overrides import parse, sweep
 from giril_rl.recipes import Recipe
+from giril_rl.sources import check_sources, sources
 from giril_rl.study.spec import Group, Spec, override_text
 
 _STUDYS_OWN = ("out", "root")
@@ -50,7 +58,12 @@ class StudyRun:
 
     @property
     def finished(self) -> bool:
-        """Whether the run has its result."""
+        """Whether the run has its result, with the scores that are asked for."""
+        return self.has_result and is_scored_as(self.folder, self.config.eval)
+
+    @property
+    def has_result(self) -> bool:
+        """Whether the run has a result."""
         return (self.folder / "result.json").exists()
 
     @property
@@ -69,8 +82,7 @@ class Planner:
     def __init__(self, root: Path) -> None:
         self.root = root
         self._schemas: dict[str, tuple[Recipe, type[Any]]] = {}
-        self._resolutions: dict[tuple[str, ...], tuple[Any, dict[str, str]]] = {}
-        self._composed: dict[tuple[str, ...], tuple[Any, dict[str, str], tuple[str, ...]]] = {}
+        self._jobs = Jobs()
 
     def plan(self, spec: Spec, changes: Sequence[str] = ()) -> list[StudyRun]:
         """All runs of ``spec``, those of the lowest seed first.
@@ -104,6 +116,7 @@ class Planner:
                     f"{spec.name}: two recipes of the name {run.recipe.name} would share the "
                     f"folder {run.folder}: rename one of their files."
                 )
+            self._check_modules(spec, run, changes)
             _check_finished(run)
         return sorted(runs.values(), key=lambda run: run.config.seed)
 
@@ -117,8 +130,6 @@ class Planner:
     def _runs(
         self, group: Group, word: str, changes: Sequence[str], shared: Sequence[str]
     ) -> list[StudyRun]:
-        from giril_rl.overrides import sweep
-
         recipe, schema = self._recipe(word)
         # What no recipe has is left in, to be refused; so are choices such as the task.
         changes = [text for text in changes if text in shared or _has(schema, text)]
@@ -149,50 +160,36 @@ class Planner:
             self._schemas[word] = recipe, config_class(recipe)
         return self._schemas[word]
 
-    def _run(self, label: str, recipe: Recipe, job: Sequence[str]) -> StudyRun:
-        # Composing takes a tenth of a second, and most runs differ in their seed alone.
-        seeds = [text for text in job if text.startswith("seed=")]
-        seed = seeds[0].partition("=")[2] if seeds else ""
-        if seed.isdecimal():
-            rest = tuple(text for text in job if text not in seeds)
-            config, changes, words = self._settled(recipe, rest)
-            config, words = replace(config, seed=int(seed)), (*words, f"seed={int(seed)}")
-        else:
-            config, changes, words = self._settled(recipe, tuple(job))
-        config = replace(config, root=str(self.root))
-        folder = out_folder(recipe.name, config, changes)
-        return StudyRun(label, recipe, words, config, folder, self.root)
+    def _run(self, label: str, recipe: Recipe, texts: Sequence[str]) -> StudyRun:
+        job = self._jobs.job(recipe, self._recipe(recipe.word)[1], texts)
+        config = replace(job.config, root=str(self.root))
+        folder = out_folder(recipe.name, config, job.changes)
+        return StudyRun(label, recipe, job.words, config, folder, self.root)
 
-    def _settled(
-        self, recipe: Recipe, words: tuple[str, ...]
-    ) -> tuple[Any, dict[str, str], tuple[str, ...]]:
-        """The configuration, and the changes and words that make it.
+    def _check_modules(self, spec: Spec, run: StudyRun, changes: Sequence[str]) -> None:
+        """Refuses a module that the study's file alone names, or that cannot be found.
 
-        A knob that is set to what it is anyway is left out, so that a run has one folder however it
-        was asked for, and studies share it.
+        Anybody may have written the file. What the command line names is imported, and so is what
+        a recipe's own settings name, which is a program in any case.
         """
-        known = (recipe.word, *words)
-        if known not in self._composed:
-            config, changes = self._resolved(recipe, words)
-            task = tuple(word for word in words if word.partition("=")[0].startswith("task"))
-            base, _ = self._resolved(recipe, task)
-            kept = tuple(word for word in words if word in task or _differs(word, config, base))
-            if kept != words:
-                shorter, fewer = self._resolved(recipe, kept)
-                # A default may follow another knob: then all of them are needed.
-                if asdict(shorter) == asdict(config):
-                    changes, words = fewer, kept
-            self._composed[known] = config, changes, words
-        return self._composed[known]
-
-    def _resolved(self, recipe: Recipe, words: Sequence[str]) -> tuple[Any, dict[str, str]]:
-        from giril_rl.compose import resolved
-
-        known = (recipe.word, *words)
-        if known not in self._resolutions:
-            schema = self._recipe(recipe.word)[1]
-            self._resolutions[known] = resolved(recipe, schema, words)
-        return self._resolutions[known]
+        modules = modules_of(run.config)
+        if not modules:
+            return
+        known = []
+        for texts in sweep(changes):
+            given = {override.get_key_element(): override.value() for override in parse(texts)}
+            known += named_modules(given.get("task.env_id"), given.get("imports"))
+        choices = [text for text in run.words if text.partition("=")[0] in groups(run.recipe)]
+        node = compose(run.recipe, self._recipe(run.recipe.word)[1], choices).node
+        own: Any = OmegaConf.to_container(node, resolve=False)
+        known += named_modules(own["task"]["env_id"], own["imports"])
+        for module in modules:
+            if module not in known:
+                raise UserError(
+                    f"{spec.name} names the module {module}, and a study's file alone imports "
+                    f"nothing: if you trust it, add imports=[{module}] to the command."
+                )
+        check_found(modules, *run.recipe.folders)
 
 
 @contextmanager
@@ -202,14 +199,6 @@ def _naming(spec: Spec, group: Group) -> Iterator[None]:
         yield
     except UserError as error:
         raise UserError(f"{spec.name}, group {group.label!r}: {error}") from None
-
-
-def _differs(word: str, config: Any, base: Any) -> bool:
-    for name in word.partition("=")[0].split("."):
-        if not hasattr(config, name):
-            return True
-        config, base = getattr(config, name), getattr(base, name)
-    return bool(config != base)
 
 
 def _holds_list(schema: type[Any], key: str) -> bool:
@@ -238,10 +227,9 @@ def _twice(spec: Spec, one: StudyRun, other: StudyRun) -> str:
 
 
 def _check_finished(run: StudyRun) -> None:
-    """Refuses a finished run in the way that was made with other settings."""
-    from giril_rl.files import read_json
-
-    if run.finished:
+    """Refuses a run in the way that was made with other settings or by other code."""
+    check_sources(run.folder, sources(run.recipe, modules_of(run.config)))
+    if run.has_result:
         made = read_json(run.folder / "result.json").get("config_hash")
         if made is not None and made != config_hash(run.config):
             raise UserError(

@@ -103,5 +103,5 @@ class _Act(nn.Module):
         super().__init__()
         self.agent = agent
 
-    def forward(self, observation: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def forward(self, observation: Tensor) -> tuple[Tensor, ...]:
         return self.agent.act(observation)

@@ -50,6 +50,8 @@ def clone_behaviour(
     steps and never fitted; with "fixed" they are those of the last step, and ``held_out`` is only
     logged.
 
+    Box actions are fitted in the policy's own units, in which the bounds are -1 and 1.
+
     The loss of a Box action says nothing of the sampling policy's deviation. It is set at the end
     to the root mean squared error of the mean action, which is its maximum of likelihood, on the
     held-out pairs, or on the fitted ones with "fixed"; at least ``cfg.min_std``.
@@ -57,7 +59,8 @@ def clone_behaviour(
     Args:
         agent: the policy; its actor, normaliser and deviation are changed in place.
         fitted: pairs to fit, batch ``(n,)``, with ``"observation"`` (raw) and ``"action"`` as
-            executed: within the bounds of Box actions, integers for Discrete ones.
+            executed: Box actions in the environment's units and within the bounds, Discrete ones as
+            integers or one-hot vectors.
         cfg: settings.
         seed: seeds the minibatches, where there are any.
         run: where metrics and checkpoints go.
@@ -146,8 +149,8 @@ def set_deviation(agent: Agent, pairs: TensorDictBase, least: float) -> None:
 
     Args:
         agent: the policy; one for Discrete actions is left as it is.
-        pairs: ``"normalised"`` observations and ``"action"``.
-        least: smallest deviation, in units of the action.
+        pairs: ``"normalised"`` observations and ``"action"``, in the policy's own units.
+        least: smallest deviation, in the same units: of half the range of a bounded action.
 
     Examples:
         >>> from torchrl.data import Bounded
@@ -176,9 +179,15 @@ def _loss(agent: Agent) -> BCLoss:
 
 
 def _pairs(agent: Agent, data: TensorDictBase) -> TensorDict:
+    """Normalised observations and what the actor's output is fitted to."""
     data = data.to(agent.device)
     normalised = agent.normaliser(data.get("observation"))
-    return TensorDict({NORMALISED: normalised, "action": data.get("action")}, data.shape)
+    action = data.get("action")
+    if agent.bounds is not None:
+        action = agent.bounds.inverse(action)
+    elif agent.discrete and action.ndim > data.ndim:
+        action = action.long().argmax(-1)
+    return TensorDict({NORMALISED: normalised, "action": action}, data.shape)
 
 
 def _mean_loss(loss: BCLoss, pairs: TensorDict) -> float:

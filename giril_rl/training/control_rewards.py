@@ -19,6 +19,7 @@ from giril_rl.training.fit import fit_reward
 from giril_rl.training.metrics import METRICS, read_metrics
 from giril_rl.training.reward_models import copy_reward, curiosity_reward, generative_reward
 from giril_rl.training.run import Run
+from giril_rl.transforms.intrinsic import device_of
 
 
 def control_reward(
@@ -82,8 +83,6 @@ def moments(reward: TensorDictModuleBase, data: TensorDictBase) -> tuple[float, 
         (3.0, 0.0)
     """
     view = data.select(*reward.in_keys)
-    weight = next(reward.parameters(), None)
-    values = (
-        reward(view if weight is None else view.to(weight.device)).get(reward.out_keys[0]).double()
-    )
+    device = device_of(reward)
+    values = reward(view if device is None else view.to(device)).get(reward.out_keys[0]).double()
     return values.mean().item(), values.var(correction=0).item()

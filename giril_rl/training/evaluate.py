@@ -14,6 +14,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from giril_rl.configs import TaskConfig
 from giril_rl.envs import BatchedEnv, for_scores, make_env
+from giril_rl.networks.agents import check_actions
 from giril_rl.progress import progress
 from giril_rl.randomness import Use, seeded, stream_seed
 
@@ -80,6 +81,9 @@ def evaluate(
     Returns:
         The scores; the standard deviation is the sample's (n - 1), 0 for one episode.
 
+    Raises:
+        UserError: if the agent was made for other actions than the task's.
+
     Examples:
         >>> from giril_rl.networks.policy import ActorCritic
         >>> task = TaskConfig(name="cartpole", env_id="CartPole-v1")
@@ -107,6 +111,7 @@ def evaluate(
             env = make_env(for_scores(task), count, seed, use=use)
             env.first_index = first
             with closing(env):
+                check_actions(agent, env)
                 played.append(_play(env, policy, counted))
     returns = torch.cat([part.returns for part in played])
     lengths = torch.cat([part.lengths for part in played])

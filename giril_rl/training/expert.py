@@ -24,6 +24,7 @@ from giril_rl.demos.task import as_recorded_task, check_environment, spaces_of
 from giril_rl.envs import gym_factory, make_env, with_own_episodes
 from giril_rl.errors import UserError
 from giril_rl.files import missing, remove_empty, remove_leftovers
+from giril_rl.imports import import_modules, modules_of
 from giril_rl.naming import NO_EFFECT, out_folder, safe, without_added
 from giril_rl.networks.agents import Agent
 from giril_rl.randomness import check_device
@@ -40,12 +41,13 @@ from giril_rl.training.scaling import return_scaling
 REWARD = [("next", "reward")]
 
 
-def train_expert(cfg: ExpertRunConfig, folder: Path) -> dict[str, Any]:
+def train_expert(cfg: ExpertRunConfig, folder: Path, *, recipe: str = "expert") -> dict[str, Any]:
     """Trains PPO on the true reward and scores it, or returns what an earlier run left.
 
     Args:
         cfg: the expert's settings.
         folder: the run's folder.
+        recipe: the recipe's name.
 
     Returns:
         The contents of ``result.json``.
@@ -54,7 +56,7 @@ def train_expert(cfg: ExpertRunConfig, folder: Path) -> dict[str, Any]:
         Interrupted: after a checkpoint, if the user asked for it with Ctrl-C.
     """
     check_task(cfg)
-    with Run.open(folder, asdict(cfg), recipe="expert", logger=cfg.logger) as run:
+    with Run.open(folder, asdict(cfg), recipe=recipe, logger=cfg.logger) as run:
         if run.finished:
             return read_result(folder)
         env = run.closing(make_env(cfg.task, cfg.ppo.num_envs, cfg.seed, use="player"))
@@ -75,7 +77,7 @@ def train_expert(cfg: ExpertRunConfig, folder: Path) -> dict[str, Any]:
             stop_at=cfg.task.expert_score if cfg.stop_early else None,
             use="player",
         )
-        return finish_run(run, cfg, agent, trained, method="expert")
+        return finish_run(run, cfg, agent, trained)
 
 
 def obtain_expert(cfg: RunConfig, expert: ExpertConfig) -> tuple[Path, dict[str, Any]]:
@@ -109,6 +111,7 @@ def expert_settings(cfg: RunConfig, expert: ExpertConfig) -> ExpertRunConfig:
         ExpertRunConfig(
             task=with_own_episodes(cfg.task),
             root=cfg.root,
+            imports=cfg.imports,
             logger=cfg.logger,
             threads=cfg.threads,
             device=cfg.device,
@@ -122,9 +125,12 @@ def expert_settings(cfg: RunConfig, expert: ExpertConfig) -> ExpertRunConfig:
 def check_task(cfg: RunConfig) -> None:
     """Looks for environment and device, before a run's folder is made.
 
+    The modules that ``cfg`` names are imported.
+
     Raises:
-        UserError: if either is not there.
+        UserError: if any of them is not there.
     """
+    import_modules(modules_of(cfg), Path.cwd())
     check_device(cfg.device)
     gym_factory(cfg.task)
 

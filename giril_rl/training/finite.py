@@ -42,7 +42,7 @@ class Finite:
         found = first_not_finite(seen)
         # After an action that is not finite any observation may come: the policy is to blame.
         if found is not None and first_not_finite(batch.select("action")) is None:
-            raise self._error(found, step, "data")
+            raise self.error(found, step, "data")
 
     def losses(
         self, values: Mapping[str, float], step: int, batch: TensorDictBase | None = None
@@ -59,8 +59,8 @@ class Finite:
             if not math.isfinite(value):
                 found = None if batch is None else first_not_finite(batch)
                 if found is not None:
-                    raise self._error(f"{found}, so that {name} is {value}", step, "data")
-                raise self._error(f"{name} is {value}", step)
+                    raise self.error(f"{found}, so that {name} is {value}", step, "data")
+                raise self.error(f"{name} is {value}", step)
 
     def weights(self, module: nn.Module, step: int) -> None:
         """Raises RunError if a parameter of the module is not finite, or a buffer has a NaN.
@@ -69,12 +69,13 @@ class Finite:
         """
         for name, parameter in module.named_parameters():
             if not torch.isfinite(parameter).all():
-                raise self._error(f"{name} has weights that are not finite", step)
+                raise self.error(f"{name} has weights that are not finite", step)
         for name, buffer in module.named_buffers():
             if torch.isnan(buffer).any():
-                raise self._error(f"{name} has statistics that are not numbers", step)
+                raise self.error(f"{name} has statistics that are not numbers", step)
 
-    def _error(self, what: str, step: int, cause: str = "step size") -> RunError:
+    def error(self, what: str, step: int, cause: str = "step size") -> RunError:
+        """What went wrong at ``step``, and what to do where ``cause`` is "step size" or "data"."""
         remedy = (
             "give a smaller step size, or look at the rewards and observations"
             if cause == "step size"

@@ -5,11 +5,12 @@ from __future__ import annotations
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from torchrl.data import TensorSpec
+from torchrl.data import Categorical, OneHot, TensorSpec
 
 from giril_rl.configs import TaskConfig
 from giril_rl.demos.task import spaces_of
 from giril_rl.errors import UserError
+from giril_rl.networks.action_bounds import single_action_spec
 from giril_rl.progress import progress
 from giril_rl.training.evaluate import evaluate
 
@@ -23,7 +24,7 @@ class HeldAction(TensorDictModuleBase):
     The baseline "Const" of the Arcade Learning Environment (Bellemare et al., 2013, section 4).
 
     Args:
-        action_spec: the spec of a batched environment.
+        action_spec: the environment's spec, of which the action has the encoding.
         action: the number of the action.
 
     Raises:
@@ -45,6 +46,10 @@ class HeldAction(TensorDictModuleBase):
         self.in_keys: list[str] = []
         self.out_keys = ["action"]
         self.action = action
+        one_hot = isinstance(single_action_spec(action_spec), OneHot)
+        self._written = (
+            torch.eye(count, dtype=torch.int64)[action] if one_hot else torch.tensor(action)
+        )
 
     @classmethod
     def of_task(cls, task: TaskConfig, action: int) -> HeldAction:
@@ -57,7 +62,8 @@ class HeldAction(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes the action for each element of the batch."""
-        return tensordict.set("action", torch.full(tensordict.batch_size, self.action))
+        shape = (*tensordict.batch_size, *self._written.shape)
+        return tensordict.set("action", self._written.expand(shape).clone())
 
 
 def check_discrete(task: TaskConfig) -> None:
@@ -104,7 +110,8 @@ def held_action_scores(task: TaskConfig, *, episodes: int, seed: int) -> list[fl
 
 
 def _number_of_actions(spec: TensorSpec) -> int:
-    if spec.dtype.is_floating_point:
+    spec = single_action_spec(spec)
+    if not isinstance(spec, (Categorical, OneHot)):
         raise UserError(
             "reward=held_action needs discrete actions, and this task's are continuous: choose "
             "another control."

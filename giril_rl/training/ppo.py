@@ -20,7 +20,7 @@ from torchrl.objectives.value import GAE
 from giril_rl.configs import PPOConfig
 from giril_rl.envs import BatchedEnv
 from giril_rl.errors import UserError
-from giril_rl.networks.agents import Agent
+from giril_rl.networks.agents import Agent, check_actions
 from giril_rl.progress import progress
 from giril_rl.randomness import Use, restore_rng, rng_state, stream_seed
 from giril_rl.training.acting import collecting
@@ -30,23 +30,33 @@ from giril_rl.training.interrupt import Interrupt, Interrupted
 from giril_rl.training.restoring import restoring
 from giril_rl.training.threads import made_on_one_thread
 from giril_rl.training.traced import TracedGradients
-from giril_rl.transforms.scaling import ReturnScaling
+from giril_rl.transforms.batch_mean import BatchMeanReward
+from giril_rl.transforms.scaling import NonFiniteReward, ReturnScaling
 
 if TYPE_CHECKING:
     from giril_rl.training.reward_learner import RewardLearner
     from giril_rl.training.run import Run
 
-LEARNER_KEYS = ("action", "action_log_prob", "advantage", "value_target")
+LEARNER_KEYS = ("action_log_prob", "advantage", "value_target")
+"""What PPO's loss reads of a minibatch, besides the networks' inputs and the agent's draws."""
 NO_FAILURE = "no_failure"
 """Stands for ``"terminated"`` where a failure is taken for a time limit: False everywhere."""
 
 
 class Trained(NamedTuple):
-    """How long a training was, and how often it was resumed without its running episodes."""
+    """What a training was.
+
+    Attributes:
+        steps: environment steps.
+        seconds: wall-clock seconds.
+        inexact_resumes: how often it was resumed without its running episodes.
+        averaged: whether its rewards were averaged over the environments.
+    """
 
     steps: int
     seconds: float
     inexact_resumes: int = 0
+    averaged: bool = False
 
 
 Rest = ParamSpec("Rest")
@@ -95,7 +105,8 @@ def train_ppo(
         relabel: a transform or a composition of them, called with each batch ``(num_envs, time)``;
             its ``state_dict`` is checkpointed.
         cfg: settings of PPO.
-        steps: environment steps in all, a multiple of ``cfg.num_envs * cfg.rollout``.
+        steps: environment steps in all, rounded up to whole batches of
+            ``cfg.num_envs * cfg.rollout``.
         seed: seeds action sampling and minibatch order.
         run: where metrics and checkpoints go.
         phase: name of the checkpoint and of the metrics.
@@ -110,14 +121,18 @@ def train_ppo(
         Environment steps, seconds and inexact resumes, those of earlier processes included.
 
     Raises:
+        UserError: if the agent was made for other actions than the environment's.
         Interrupted: after a checkpoint, if the user asked for it with Ctrl-C.
         RunError: if a loss or a weight is no longer finite; the last checkpoint stays.
     """
+    check_actions(agent, env)
+    steps = cfg.whole_batches(steps)
     relabel.to(agent.device)
     learner = PPOLearner(agent, cfg, total_steps=steps, termination=termination)
     tracker = EpisodeTracker(cfg.num_envs)
     recent: deque[float] = deque(maxlen=20)
     parts = nn.ModuleDict({"agent": agent, "tracker": tracker, "relabel": relabel})
+    averaged = any(isinstance(part, BatchMeanReward) for part in relabel.modules())
     taken, inexact, exact = 0, 0, True
     saved = run.load(phase)
     if saved is not None:
@@ -127,7 +142,7 @@ def train_ppo(
             recent.extend(saved["recent"])
             if taken >= steps or saved["stopped"]:
                 parts.load_state_dict(saved["parts"])
-                return Trained(taken, saved["seconds"], inexact)
+                return Trained(taken, saved["seconds"], inexact, averaged)
             exact = env.restore_simulator(saved["simulator"])
             inexact += not exact
     batch_size = cfg.num_envs * cfg.rollout
@@ -181,7 +196,12 @@ def train_ppo(
                 batch = batch.to(agent.device)
             finite.observations(batch, taken + batch_size)
             learned = {} if learn_reward is None else learn_reward.update(batch)
-            losses = learner.learn(relabel(batch), taken)
+            finite.losses(learned, taken + batch_size)  # Before its reward is used.
+            try:
+                batch = relabel(batch)
+            except NonFiniteReward as error:
+                raise finite.error(error.what, taken + batch_size, "data") from error
+            losses = learner.learn(batch, taken)
             taken += batch_size
             metrics = {f"{phase}/{k}": v for k, v in losses.items()}
             metrics.update(learned)
@@ -194,7 +214,6 @@ def train_ppo(
                 true_return = f"{metrics['train/return_mean']:,.1f}"
             bar.update(batch_size, true_return=true_return)
             run.log(taken, metrics, phase=phase)
-            finite.losses(learned, taken)
             finite.losses(losses, taken, batch.select(("next", "reward")))
             if stop_at is not None and len(recent) == recent.maxlen:
                 stopped = sum(recent) / len(recent) >= stop_at
@@ -221,7 +240,7 @@ def train_ppo(
     if interrupt.requested:  # At the end as well, for the run may have more to do.
         whose = "player" if run.recipe == "expert" else "policy"
         raise Interrupted.at(taken, steps, part=f"the {whose}'s training", most=stop_at is not None)
-    return Trained(taken, time.perf_counter() - began, inexact)
+    return Trained(taken, time.perf_counter() - began, inexact, averaged)
 
 
 def forget_episodes(parts: nn.Module) -> None:
@@ -279,7 +298,12 @@ class PPOLearner:
             functional=False,
         )
         # The clipped value loss compares with the value as it was.
-        self.keys = (*agent.input_keys, *LEARNER_KEYS, *["state_value"] * cfg.clip_value)
+        self.keys = (
+            *agent.input_keys,
+            agent.drawn_key,
+            *LEARNER_KEYS,
+            *["state_value"] * cfg.clip_value,
+        )
         self.gradients = TracedGradients(
             loss,
             keys=self.keys,

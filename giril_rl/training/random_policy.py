@@ -5,11 +5,12 @@ from __future__ import annotations
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from torchrl.data import TensorSpec, Unbounded
+from torchrl.data import Categorical, OneHot, TensorSpec
 
 from giril_rl.configs import TaskConfig
 from giril_rl.demos.task import spaces_of
 from giril_rl.errors import UserError
+from giril_rl.networks.action_bounds import affine_map, single_action_spec
 from giril_rl.randomness import stream_seed
 
 RANDOM = "control:random"
@@ -27,7 +28,7 @@ class RandomPolicy(TensorDictModuleBase):
         seed: of the actions.
 
     Raises:
-        UserError: for actions without bounds, which have no uniform distribution.
+        UserError: for actions without two bounds, which have no uniform distribution.
 
     Examples:
         >>> import torch
@@ -41,7 +42,8 @@ class RandomPolicy(TensorDictModuleBase):
 
     def __init__(self, action_spec: TensorSpec, seed: int = 0) -> None:
         super().__init__()
-        if isinstance(action_spec, Unbounded):
+        action_spec = single_action_spec(action_spec)
+        if not (isinstance(action_spec, (Categorical, OneHot)) or _all_bounded(action_spec)):
             raise UserError(
                 "actions without bounds have no uniform distribution: choose a task with bounded "
                 "actions for the random policy."
@@ -68,3 +70,8 @@ class RandomPolicy(TensorDictModuleBase):
             action = self.action_spec[0].rand(tensordict.batch_size)
             self._stream = torch.get_rng_state()
         return tensordict.set("action", action)
+
+
+def _all_bounded(spec: TensorSpec) -> bool:
+    bounds = affine_map(spec)
+    return bool((bounds.low.isfinite() & bounds.high.isfinite()).all())

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import warnings
 from datetime import UTC, datetime
 from typing import Any
 
 from torch import nn
 
-from giril_rl.configs import DemoConfig, RunConfig
+from giril_rl.configs import ControlRunConfig, DemoConfig, RunConfig, UnaveragedRunConfig
 from giril_rl.demos import Demonstration
 from giril_rl.files import processor
 from giril_rl.naming import config_hash
@@ -48,7 +49,7 @@ def finish_run(
     agent: Agent | RandomPolicy | HeldAction,
     trained: Trained,
     *,
-    method: str,
+    method: str | None = None,
     expert: dict[str, Any] | None = None,
     demo: Demonstration | None = None,
     seeds: dict[str, int] | None = None,
@@ -62,7 +63,7 @@ def finish_run(
         agent: the trained policy; or one that was not trained, of which nothing is saved but the
             number of the action that it holds.
         trained: its steps and seconds.
-        method: the method's name in tables.
+        method: deprecated and not read, for a run's method is the recipe's name.
         expert: the expert's result, if there was one.
         demo: the demonstration, if there was one.
         seeds: seeds besides those of policy, evaluation, expert and demonstration.
@@ -71,11 +72,18 @@ def finish_run(
     Returns:
         What ``result.json`` holds.
     """
+    if method is not None:
+        warnings.warn(
+            "finish_run's method= is not read any more: a run's method is the name that "
+            "Run.open(recipe=...) was given.",
+            DeprecationWarning,
+            stacklevel=2,
+        )
     scores = evaluate_both(agent, cfg.task, episodes=cfg.eval.episodes, seed=cfg.eval.seed)
     result: dict[str, Any] = {
-        "method": method,
+        "method": method_name(run.recipe, cfg),
         "task": cfg.task.name,
-        "profile": cfg.profile,
+        "profile": _profile(cfg, trained),
         "horizon": cfg.task.horizon,
         "termination": cfg.termination,
         "seed": cfg.seed,
@@ -103,13 +111,15 @@ def finish_run(
     }
     if isinstance(agent, HeldAction):
         result["held_action"] = agent.action
+    if isinstance(agent, RandomPolicy):
+        result["random_policy"] = True
     card = {key: result[key] for key in CARD_KEYS}
     if not isinstance(agent, (RandomPolicy, HeldAction)):
         agent.save_pretrained(run.folder / POLICY, card)
     if isinstance(reward, Pretrained):
         reward.save_pretrained(run.folder / REWARD, card)
     rows = read_metrics(run.folder / METRICS)
-    names: dict[str, Any] = {"recipe": method, "task": cfg.task.name, "seed": cfg.seed}
+    names: dict[str, Any] = {"recipe": result["method"], "task": cfg.task.name, "seed": cfg.seed}
     if loss_points(rows):
         write_losses(run.folder, rows, final_return=result["return_mean"], **names)
     else:
@@ -125,6 +135,26 @@ def finish_run(
         )
     run.finish(result)
     return result
+
+
+def method_name(recipe: str, cfg: RunConfig) -> str:
+    """A run's method: the recipe's name; of the recipe ``control``, with the reward that it takes.
+
+    Examples:
+        >>> method_name("my_recipe", RunConfig())
+        'my_recipe'
+        >>> method_name("control", ControlRunConfig(reward="copy"))
+        'control:copy'
+    """
+    if recipe == "control" and isinstance(cfg, ControlRunConfig):
+        return f"control:{cfg.reward}"
+    return recipe
+
+
+def _profile(cfg: RunConfig, trained: Trained) -> str | None:
+    """The profile, None where it makes no difference: nothing is averaged in either."""
+    has_none = isinstance(cfg, UnaveragedRunConfig) or (cfg.batch_mean and not trained.averaged)
+    return None if has_none else cfg.profile
 
 
 def _source(cfg: RunConfig, demo: Demonstration) -> str:

@@ -33,6 +33,10 @@ def _or_none(check: Check) -> Check:
     return lambda value: value is None or check(value)
 
 
+def _flag(value: Any) -> bool:
+    return isinstance(value, bool)
+
+
 def _mapping(value: Any) -> bool:
     return isinstance(value, dict)
 
@@ -69,6 +73,8 @@ OPTIONAL: dict[str, Check] = {
     "demo_transitions": _or_none(_natural),
     "processor": _or_none(_word),
     "held_action": _natural,
+    "random_policy": _flag,
+    "versions": _mapping,
 }
 """What runs of some kind, or of an earlier version, have not."""
 
@@ -107,6 +113,9 @@ def _first_wrong(result: dict[str, Any]) -> str | None:
     for key, seed in result.get("seeds", {}).items():
         if not _or_none(_natural)(seed):
             return f"seeds.{key}" if _word(key) else "seeds"
+    for key, text in result.get("versions", {}).items():
+        if not _or_none(_word)(text):
+            return f"versions.{key}" if _word(key) else "versions"
     mode = result.get("deterministic")
     for key, check in SCORES.items():
         if mode is not None and not check(mode.get(key)):

@@ -27,6 +27,7 @@ from giril_rl.formats import RUN_FORMAT, check_run_format
 from giril_rl.naming import NO_EFFECT, without_added
 from giril_rl.places import cannot_write, check_place
 from giril_rl.schema import flat
+from giril_rl.sources import sources_of
 from giril_rl.training.checkpoint import load_state, save_state
 from giril_rl.training.metrics import METRICS, MetricsFile, check_logger, end_logger, make_logger
 from giril_rl.untrusted import parse_yaml, read_text
@@ -42,7 +43,8 @@ class Run:
     ========================  ====================================================================
     ``config.yaml``           the resolved configuration, with the recipe's name
     ``versions.json``         the format of the folder, Python and the packages that decide the
-                              numbers
+                              numbers, and digests of the user's own code, see
+                              :mod:`giril_rl.sources`
     ``metrics.jsonl``         measurements, one JSON object a line
     ``NAME.safetensors``      checkpoints, see :func:`giril_rl.training.checkpoint.save_state`
     ``result.json``           written last; where it is, the run is finished
@@ -126,8 +128,9 @@ class Run:
         try:
             for leftover in run.folder.glob(".*.tmp"):
                 leftover.unlink()
-            run._write_or_compare_config(ignore)
+            run._compare_config(ignore)
             run._check_checkpoints()
+            run._write_config()
             run._write_versions()
             run._metrics = MetricsFile(run.folder / METRICS)
         except BaseException as error:
@@ -250,12 +253,13 @@ class Run:
                 "choose another out=."
             )
 
-    def _write_or_compare_config(self, ignore: Collection[str]) -> None:
-        path = self.folder / "config.yaml"
+    def _written_config(self) -> dict[str, Any]:
         # Through JSON, so that tuples and lists compare equal, as they do once written.
-        config = json.loads(json.dumps({"recipe": self.recipe, **self.config}))
+        return json.loads(json.dumps({"recipe": self.recipe, **self.config}))
+
+    def _compare_config(self, ignore: Collection[str]) -> None:
+        path = self.folder / "config.yaml"
         if not path.exists():
-            write_atomically(path, yaml.safe_dump(config, sort_keys=False))
             return
         try:
             before = parse_yaml(read_text(path))
@@ -263,13 +267,20 @@ class Run:
             before = None
         if not isinstance(before, dict):
             raise UserError(f"{path} cannot be read: choose another out=, or delete the folder.")
-        differences = _differences(before, config, ignore)
+        differences = _differences(before, self._written_config(), ignore)
         if differences:
             more = f" and {len(differences) - 3} more" if len(differences) > 3 else ""
             raise UserError(
                 f"{self.folder} was made with other settings ({'; '.join(differences[:3])}{more}): "
                 "choose another out=, or delete the folder."
             )
+
+    def _write_config(self) -> None:
+        """An unfinished run goes on with the settings of now, where they may differ."""
+        path = self.folder / "config.yaml"
+        config = self._written_config()
+        if not path.exists() or not (self.finished or parse_yaml(read_text(path)) == config):
+            write_atomically(path, yaml.safe_dump(config, sort_keys=False))
 
     def _check_checkpoints(self) -> None:
         """A damaged one is refused now, not when its part's turn has come."""
@@ -282,6 +293,8 @@ class Run:
         if self.finished and path.exists():
             return  # What is only looked at was not made with these versions.
         before = read_json(path) if path.exists() else self.versions
+        known = before.get("sources")
+        sources = {**(known if isinstance(known, dict) else {}), **sources_of(self.folder)}
         for name, now in self.versions.items():
             if before.get(name) != now:
                 warnings.warn(
@@ -289,7 +302,8 @@ class Run:
                     f"{now}: its numbers may not repeat.",
                     stacklevel=4,
                 )
-        write_json(path, {"format_version": RUN_FORMAT, **self.versions})
+        content = {"format_version": RUN_FORMAT, **self.versions}
+        write_json(path, {**content, "sources": sources} if sources else content)
 
 
 def _close(part: Any) -> None:

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import torch
-from tensordict import TensorDictBase, unravel_key
+from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
-from torchrl.envs import Transform
+from torch import Tensor
 
 from giril_rl.errors import UserError
+from giril_rl.transforms.reward_transform import RewardTransform, copied, split_mask
 
 
-class BatchMeanReward(Transform):
+class BatchMeanReward(RewardTransform):
     """Replaces a step's reward by its mean over the environments.
 
     The released GIRIL code averages eq. 2 over the parallel environments as well (its
@@ -26,6 +27,10 @@ class BatchMeanReward(Transform):
         reward_key: the reward, without the ``"next"``.
         time_dim: which of the batch dimensions is time.
 
+    Raises:
+        UserError: if there is no reward, for one of another shape than the environment's spec says,
+            and for split trajectories, which are not side by side in time.
+
     Examples:
         >>> from tensordict import TensorDict
         >>> reward = torch.tensor([[[1.0], [2.0]], [[3.0], [6.0]]])  # 2 environments, 2 steps
@@ -35,28 +40,32 @@ class BatchMeanReward(Transform):
     """
 
     def __init__(self, reward_key: NestedKey = "reward", time_dim: int = -1) -> None:
-        self.reward_key = unravel_key(reward_key)
-        super().__init__(in_keys=[self.reward_key], out_keys=[self.reward_key])
+        super().__init__(reward_key)
         self.time_dim = time_dim
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Averages a batch ``[N, T]`` in place, step by step, and returns it."""
-        dims = list(range(tensordict.ndim))
+        """Averages a batch ``[N, T]`` step by step and returns it, as a shallow copy."""
+        batch, following = copied(tensordict)
+        if split_mask(batch) is not None:
+            raise UserError(
+                "the batch holds split trajectories, whose steps are not those of one time: "
+                "collect with split_trajs=False."
+            )
+        dims = list(range(batch.ndim))
         if dims:
             dims.pop(self.time_dim)
-        self._average(tensordict, ("next", self.reward_key), dims)
-        return tensordict
+        self._average(following, self._read(following), dims)
+        return batch
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         dims = list(range(next_tensordict.ndim))
-        self._average(next_tensordict, self.reward_key, dims)
+        self._average(next_tensordict, self._read_step(next_tensordict), dims)
         return next_tensordict
 
-    def _average(self, tensordict: TensorDictBase, key: NestedKey, dims: list[int]) -> None:
-        reward = tensordict.get(unravel_key(key))
+    def _average(self, following: TensorDictBase, reward: Tensor, dims: list[int]) -> None:
         if dims:
             mean = reward.mean(dims, keepdim=True)
-            tensordict.set(unravel_key(key), torch.empty_like(reward).copy_(mean))
+            following.set(self.reward_key, torch.empty_like(reward).copy_(mean))
 
     def _check_batched_worker_compat(self) -> None:
         raise UserError(

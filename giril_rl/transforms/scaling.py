@@ -11,9 +11,9 @@ from tensordict import TensorDictBase, unravel_key
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.data import Bounded, Composite, Unbounded
-from torchrl.envs import Transform
 
 from giril_rl.errors import UserError
+from giril_rl.transforms.reward_transform import RewardTransform, copied, split_mask
 from giril_rl.transforms.running import discounted_filter, running_moments
 
 ResetRule = Literal["never", "done"]
@@ -22,7 +22,25 @@ ResetRule = Literal["never", "done"]
 INITIAL_COUNT = 1e-4
 
 
-class ReturnScaling(Transform):
+class NonFiniteReward(UserError):
+    """A reward that is NaN, infinite or too large, from which no running deviation can be learned.
+
+    Args:
+        what: names the reward and its place.
+
+    Examples:
+        >>> raise NonFiniteReward("the reward is nan in environment 0 at step 5 of the batch")
+        Traceback (most recent call last):
+        giril_rl.transforms.scaling.NonFiniteReward: the reward is nan in environment 0 at step 5 of
+        the batch: look at what it is computed from.
+    """
+
+    def __init__(self, what: str) -> None:
+        super().__init__(f"{what}: look at what it is computed from.")
+        self.what = what
+
+
+class ReturnScaling(RewardTransform):
     """Divides the reward by the running standard deviation of ``R_t = gamma * R_{t-1} + r_t``.
 
     No mean is subtracted, so that a reward keeps its sign. The filter runs over time, for each
@@ -38,7 +56,9 @@ class ReturnScaling(Transform):
 
     In an environment all batch dimensions are environments. In a batch, ``time_dim`` is time and
     the others are environments; a flat batch is one environment's time. Inside a worker of a
-    batched environment it would see one environment only, and refuses.
+    batched environment it would see one environment only, and refuses. Nor does it learn from split
+    trajectories, which are padded and not side by side in time. A batch is not changed: a shallow
+    copy of it is returned.
 
     After :meth:`freeze` nothing is learned: rewards of any batch shape, also shuffled, are divided
     by the present deviation. For batches, eval mode does the same. In an environment it does not,
@@ -57,6 +77,9 @@ class ReturnScaling(Transform):
     Raises:
         UserError: for a gamma, reset rule, clip or eps that makes no sense, a batch with another
             number of environments than before, or when frozen before anything was learned.
+        NonFiniteReward: for a reward that is NaN, infinite or too large to be squared, naming its
+            environment and step; nothing is learned from its batch. A compiled graph cannot
+            raise: it learns nothing and gives NaN.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -91,8 +114,7 @@ class ReturnScaling(Transform):
             raise UserError(f"clip={clip} is not positive: give a bound such as 10.0, or None.")
         if not (eps >= 0 and math.isfinite(eps)):
             raise UserError(f"eps={eps} is negative or not finite: give a value such as 1e-8.")
-        self.reward_key = unravel_key(reward_key)
-        super().__init__(in_keys=[self.reward_key], out_keys=[self.reward_key])
+        super().__init__(reward_key)
         self.done_key = unravel_key(done_key)
         self.gamma = gamma
         self.reset_rule: ResetRule = reset
@@ -108,17 +130,22 @@ class ReturnScaling(Transform):
 
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Scales a batch in place, step after step along ``time_dim``, and returns it."""
-        following = tensordict.get("next", None)
-        if following is None:
-            raise UserError("the batch has no ('next', ...) entries: give whole transitions.")
-        time_dim = self.time_dim % tensordict.ndim if tensordict.ndim else None
+        """Scales a batch step after step along ``time_dim`` and returns it, as a shallow copy."""
+        batch, following = copied(tensordict)
+        time_dim = self.time_dim % batch.ndim if batch.ndim else None
         learn = self.training and not self.frozen
-        return tensordict.set("next", self._scale(following, time_dim, learn))
+        if learn and split_mask(batch) is not None:
+            raise UserError(
+                "the batch holds split trajectories, padded and not side by side in time: collect "
+                "with split_trajs=False, or call .freeze() to scale without learning."
+            )
+        self._scale(following, self._read(following), time_dim, learn)
+        return batch
 
     @torch.no_grad()
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
-        return self._scale(next_tensordict, None, not self.frozen)
+        reward = self._read_step(next_tensordict)
+        return self._scale(next_tensordict, reward, None, not self.frozen)
 
     def freeze(self) -> ReturnScaling:
         """Stops learning; rewards are divided by the present deviation."""
@@ -131,9 +158,8 @@ class ReturnScaling(Transform):
         return self
 
     def _scale(
-        self, following: TensorDictBase, time_dim: int | None, learn: bool
+        self, following: TensorDictBase, reward: Tensor, time_dim: int | None, learn: bool
     ) -> TensorDictBase:
-        reward = following.get(self.reward_key)
         steps = _as_steps(reward, time_dim, self.mean)
         if learn:
             done = None
@@ -142,7 +168,8 @@ class ReturnScaling(Transform):
                 while flag.ndim < reward.ndim:
                     flag = flag.unsqueeze(-1)
                 done = _as_steps(flag.expand_as(reward), time_dim, self.mean).bool()
-            deviation = self._learn(steps, done)
+            values = reward.shape[following.ndim :].numel()
+            deviation = self._learn(steps, done, values)
         elif self.running_return.numel() == 0:
             raise UserError(
                 "ReturnScaling has learned nothing yet and is in eval mode (TorchRL's "
@@ -156,7 +183,7 @@ class ReturnScaling(Transform):
             scaled = scaled.clamp(-self.clip, self.clip)
         return following.set(self.reward_key, _from_steps(scaled, reward, time_dim))
 
-    def _learn(self, steps: Tensor, done: Tensor | None) -> Tensor:
+    def _learn(self, steps: Tensor, done: Tensor | None, values: int) -> Tensor:
         envs, before = steps.shape[0], self.running_return
         first = before.numel() == 0
         if first:
@@ -169,11 +196,17 @@ class ReturnScaling(Transform):
             )
         returns, carry = discounted_filter(steps, done, before, self.gamma)
         count, mean, m2 = running_moments(returns, self.count, self.mean, self.m2)
-        if first or steps.shape[1]:
-            # Replaced, not filled: torch.compile (2.13) loses what these buffers are filled with.
-            self.running_return = carry.clone()
         if steps.shape[1]:
-            self.count, self.mean, self.m2 = (x[-1].clone() for x in (count, mean, m2))
+            new = [carry, count[-1], mean[-1], m2[-1]]
+            if torch.compiler.is_compiling():  # A graph cannot raise.
+                old, learn = [before, self.count, self.mean, self.m2], m2[-1].isfinite()
+                new = [torch.where(learn, x, y) for x, y in zip(new, old, strict=True)]
+            elif not _finite(m2[-1]):
+                raise NonFiniteReward(_place(steps, values))
+            # Replaced, not filled: torch.compile (2.13) loses what these buffers are filled with.
+            self.running_return, self.count, self.mean, self.m2 = (x.clone() for x in new)
+        elif first:
+            self.running_return = before
         return (m2 / count + self.eps).sqrt()
 
     def _reset(
@@ -199,6 +232,7 @@ class ReturnScaling(Transform):
 
     def transform_reward_spec(self, reward_spec: Composite) -> Composite:
         """The scaled reward's bounds are the clipping's."""
+        super().transform_reward_spec(reward_spec)
         spec = reward_spec[self.reward_key]
         kind: dict[str, Any] = {"shape": spec.shape, "dtype": spec.dtype, "device": spec.device}
         if self.clip is None:
@@ -236,6 +270,25 @@ def _from_steps(steps: Tensor, like: Tensor, time_dim: int | None) -> Tensor:
     if time_dim is not None:
         steps = steps.reshape(like.movedim(time_dim, -1).shape).movedim(-1, time_dim)
     return steps.reshape(like.shape).to(like)
+
+
+def _finite(value: Tensor) -> bool:
+    """The only look at a value, once a batch."""
+    return bool(value.isfinite())
+
+
+def _place(steps: Tensor, values: int) -> str:
+    """The first reward, in time, that is not finite; an environment has so many values."""
+    bad = ~steps.isfinite()
+    if not bad.any():
+        return f"a reward of {steps.abs().max().item():g} is too large to be squared"
+    time = int(bad.any(0).nonzero()[0])
+    rows = bad[:, time].nonzero()
+    value = steps[rows[0], time].item()
+    every = len(rows) == len(steps) > values
+    where = "every environment" if every else f"environment {int(rows[0]) // values}"
+    step = f"at step {time} of the batch" if steps.shape[1] > 1 else "at this step"
+    return f"the reward is {value} in {where} {step}"
 
 
 def _reset_key(done_key: NestedKey) -> NestedKey:

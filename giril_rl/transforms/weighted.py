@@ -13,6 +13,7 @@ from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs import Transform
 
 from giril_rl.errors import UserError
+from giril_rl.transforms.reward_transform import copied, find_reward
 
 
 class WeightedReward(Transform):
@@ -61,23 +62,21 @@ class WeightedReward(Transform):
         super().__init__(in_keys=list(self.weights), out_keys=[self.reward_key])
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the sum of a batch of any shape in place and returns the batch."""
-        following = tensordict.get("next", None)
-        if following is None:
-            raise UserError("the batch has no ('next', ...) entries: give whole transitions.")
+        """Writes the sum of a batch of any shape and returns the batch, as a shallow copy."""
+        batch, following = copied(tensordict)
         self._sum(following)
-        return tensordict
+        return batch
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         return self._sum(next_tensordict)
 
     def _sum(self, following: TensorDictBase) -> TensorDictBase:
         total: Tensor | None = None
-        like = following.get(self.reward_key, None)
+        like = find_reward(following, self.reward_key)
         for key, weight in self.weights.items():
             if weight == 0:
                 continue
-            term = following.get(key, None)
+            term = find_reward(following, key)
             if term is None:
                 raise UserError(f"there is no reward under ('next', {key!r}): name another key.")
             like = term if like is None else like

@@ -90,7 +90,7 @@ def gradients(compiled: bool) -> dict[str, Callable[[], object]]:
         functional=False,
         log_explained_variance=False,
     )
-    keys = (NORMALISED, *LEARNER_KEYS)
+    keys = (NORMALISED, agent.drawn_key, *LEARNER_KEYS)
     shapes = {key: (250, 1) for key in keys} | {"action_log_prob": (250,), NORMALISED: (250, 5)}
     batch = TensorDict({key: torch.randn(shape) for key, shape in shapes.items()}, [250])
     traced = TracedGradients(loss, keys=keys)

@@ -13,11 +13,12 @@ from tempfile import TemporaryDirectory
 import gymnasium
 import torch
 from tensordict import TensorDict
-from torchrl.data import Categorical
+from torchrl.data import Bounded, Categorical
 
 from giril_rl.cli import main
 from giril_rl.demos import Demonstration, record_demonstration
 from giril_rl.networks.pixel_policy import PixelActorCritic
+from giril_rl.networks.policy import ActorCritic
 from giril_rl.rewards import GenerativeReward
 
 WORDS = [
@@ -84,13 +85,23 @@ def pixels(archive: Path) -> None:
                 packed.write(path, f"{name}/{path.name}")
 
 
+def scaled() -> ActorCritic:
+    """A policy whose actions are scaled to bounds, saved in a format of its own."""
+    low, high = torch.tensor([1000.0, -0.5]), torch.tensor([2000.0, 0.5])
+    policy = ActorCritic(2, Bounded(low, high, shape=(2,)), hidden=[])
+    with torch.no_grad():
+        policy.actor[-1].weight.copy_(torch.tensor([[0.5, 0.0], [0.0, 4.0]]))
+    return policy
+
+
 def make(folder: Path) -> None:
     os.chdir(folder)
-    for name in ("demonstration", "demonstration_of_images", "run"):
+    for name in ("demonstration", "demonstration_of_images", "run", "scaled_policy"):
         shutil.rmtree(name, ignore_errors=True)
     vectors().save("demonstration")
     images().save("demonstration_of_images")
     pixels(Path("pixels.zip"))
+    scaled().save_pretrained("scaled_policy", {"task": "scaled"})
     assert main(["run", "giril", *WORDS]) == 0
     for picture in Path("run").glob("*.png"):
         picture.unlink()

@@ -1,4 +1,5 @@
 import errno
+import hashlib
 import json
 import os
 import pickle
@@ -45,6 +46,22 @@ def test_round_trip_is_exact_and_in_memory(demo, folder, make_fn):
 def test_saved_again_after_loading(folder, tmp_path):
     Demonstration.load(folder).save(tmp_path / "copy")
     assert len(Demonstration.load(tmp_path / "copy")) == 12
+
+
+def test_id_is_a_digest_of_all_tensors(demo, folder, monkeypatch):
+    after = ("done", "observation", "reward", "terminated", "truncated")
+    content = hashlib.sha256()
+    for key in [("next", name) for name in after] + ["action", "episode", "observation", "step"]:
+        array = demo.transitions[key].numpy()
+        content.update(f"{key}torch.{array.dtype}{array.shape}".encode() + array.tobytes())
+    assert demo.demo_id == content.hexdigest()[:12]
+    assert Demonstration.load(folder).demo_id == demo.demo_id
+    assert Demonstration(demo.transitions, {}).demo_id == demo.demo_id
+    columns = demo.transitions["observation"].t().contiguous().t()  # The same in another layout.
+    monkeypatch.setattr("giril_rl.demos.demonstration._AT_ONCE", 5)
+    assert Demonstration(demo.transitions.replace(observation=columns)).demo_id == demo.demo_id
+    demo.transitions["next", "reward"][-1] += 1
+    assert demo.demo_id != Demonstration.load(folder).demo_id
 
 
 def test_nothing_is_overwritten_or_left_half_done(demo, folder, monkeypatch):

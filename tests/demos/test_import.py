@@ -103,6 +103,7 @@ def test_export_and_import_give_the_same_bits(case, form, capsys):
     )
     again = Demonstration.load("again")
     assert_same_bits(again.transitions, demo.transitions)
+    assert again.demo_id == demo.demo_id
     for key in ("seeds", "expert", "deterministic"):
         assert again.card[key] == demo.card[key]
     assert again.card.get("lives") == demo.card.get("lives")

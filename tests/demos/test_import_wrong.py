@@ -34,6 +34,7 @@ from wrong import (
     parts,
     put,
     raw,
+    renamed,
     soft,
     stray,
     texts,
@@ -158,6 +159,32 @@ CASES = {
         "observations of shape [4, 8, 8] and the task of shape [3]",
     ),
     "columns: a wrong name": (lambda: columns(rewrad=np.zeros(5)), "did you mean"),
+    "columns: a short name": (
+        lambda: renamed(datasets.columns(), observation="obs", reward="rews"),
+        "has no observation: needed are observation, action, next_observation, terminated, "
+        "truncated; did you mean 'observation' by 'obs'?",
+    ),
+    "columns: D4RL's names": (
+        lambda: renamed(
+            datasets.columns(),
+            observation="observations",
+            action="actions",
+            next_observation="next_observations",
+            reward="rewards",
+            terminated="terminals",
+            truncated="timeouts",
+        ),
+        "'observation' by 'observations' and 'action' by 'actions' and 'next_observation' by "
+        "'next_observations' and 'terminated' by 'terminals' and 'truncated' by 'timeouts'?",
+    ),
+    "columns: one end for both": (
+        lambda: renamed(datasets.columns(), truncated="dones"),
+        "truncated: needed are observation, action, next_observation, terminated, truncated.",
+    ),
+    "columns: an array too many": (
+        lambda: columns(infos=np.zeros(5)),
+        "'infos.npy' in the .npz file is not an array of a demonstration; leave it out.",
+    ),
     "columns: text": (lambda: columns(reward=np.array(["a"] * 5)), "not plain numbers"),
     "columns: objects": (lambda: columns(action=objects()), "nothing is unpickled"),
     "columns: a pickle": (
@@ -175,6 +202,10 @@ CASES = {
     ),
     "whole: an episode cut": (lambda: whole(actions=lambda x: x[:-1]), "4 rows of actions"),
     "whole: no lengths": (lambda: whole(lengths=None), "needed are observation"),
+    "whole: other names": (
+        lambda: renamed(datasets.whole(), observations="obs", lengths="episode_lengths"),
+        "'observations' by 'obs' and 'lengths' by 'episode_lengths'?",
+    ),
     "whole: no ends": (lambda: whole(terminated=None), "has lengths and no terminated"),
     "whole: an empty episode": (lambda: whole(lengths=np.array([5, 0])), "of at least 1"),
     "whole: no episode": (lambda: whole(lengths=np.array([], int)), "of at least 1"),
@@ -233,6 +264,10 @@ CASES = {
         "next states are missing",
     ),
     "memmap: no actions": (lambda: memmap(without("action")), "has no action"),
+    "memmap: a short name": (
+        lambda: memmap(lambda data: data.rename_key_(("next", "observation"), ("next", "obs"))),
+        "next.truncated; did you mean 'next.observation' by 'next.obs'?",
+    ),
     "memmap: not flat": (
         lambda: memmap(lambda data: data[:4].reshape(2, 2)),
         "has the batch shape [2, 2]",

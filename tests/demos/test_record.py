@@ -1,3 +1,7 @@
+import io
+import itertools
+import sys
+
 import gymnasium
 import numpy as np
 import pytest
@@ -24,6 +28,23 @@ def test_transitions_are_aligned_by_hand(demo):
     assert data["action"].dtype == torch.float32
     assert demo.lengths.tolist() == [5, 5, 2]
     assert demo.returns.tolist() == [5.0, 5.0, 2.0]
+
+
+@pytest.mark.parametrize("amount", [{"length": 12}, {"episodes": 2}], ids=str)
+def test_progress_is_shown_where_it_is_asked_for(amount, monkeypatch):
+    class Terminal(io.StringIO):
+        def isatty(self):
+            return True
+
+    def written(**asked):
+        monkeypatch.setattr("sys.stderr", Terminal())
+        record_demonstration(Counter, lambda o: o[:, :1], seed=0, **amount, **asked)
+        return sys.stderr.getvalue()
+
+    (total,) = amount.values()
+    assert f"{total}/{total}" in written()
+    monkeypatch.setattr("giril_rl.progress.time.monotonic", itertools.count(0, 60).__next__)
+    assert written(show_progress=False) == ""
 
 
 def test_episodes_have_seeds_of_their_own(demo):

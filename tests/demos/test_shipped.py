@@ -57,7 +57,10 @@ def test_one_life_of_the_task_from_its_first_state_on(name):
 def test_a_recipe_finds_it_by_its_task(name, tmp_path):
     env_id = named_task(name, None).env_id
     for task in (named_task(name, None), TaskConfig(name=env_id, env_id=env_id)):
-        cfg, demo = RunConfig(task=task, root=str(tmp_path), seed=1), DemoConfig(path="shipped")
+        cfg, demo = (
+            RunConfig(task=task, root=str(tmp_path), seed=1, steps=2000),
+            DemoConfig(path="shipped"),
+        )
         check_inputs(cfg, ExpertConfig(), demo)
         found, expert = obtain_demonstration(cfg, ExpertConfig(), demo)
         own = SHIPPED[name][1 % len(SHIPPED[name])]
@@ -108,7 +111,7 @@ def test_another_game_is_refused_though_all_look_alike(tmp_path):
 def test_the_card_of_a_given_demonstration_may_lie(tmp_path):
     """It was downloaded: no number but a score is taken for one."""
     demo = Demonstration.load(SHIPPED["breakout"][0])
-    cfg = RunConfig(task=named_task("breakout", None))
+    cfg = RunConfig(task=named_task("breakout", None), steps=2000)
     for number, player in enumerate([None, [], {}, {"return_mean": "x"}, {"return_mean": None}]):
         place = tmp_path / str(number)
         Demonstration(demo.transitions, {**demo.card, "expert": player}).save(place)

@@ -115,7 +115,8 @@ def test_seeds_of_hidden_resets_are_those_of_the_episodes_numbers():
             seed = stream_seed("training", 7, i, number, bits=32)
             start = gymnasium.make("CartPole-v1").reset(seed=seed)[0]
             np.testing.assert_array_equal(after["following_observation"][i, moment], start)
-            np.testing.assert_array_equal(batch["observation"][i, moment + 1 :][:1], start[None])
+            if moment + 1 < 60:
+                np.testing.assert_array_equal(batch["observation"][i, moment + 1], start)
 
 
 def test_without_a_failure_it_is_the_same_environment():

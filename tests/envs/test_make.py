@@ -18,7 +18,18 @@ def refused(env_id, **kwargs):
 def test_unknown_id_names_the_nearest():
     assert "CartPol-v1 is not a Gymnasium id; did you mean 'CartPole" in refused("CartPol-v1")
     assert "InvertedPendulumBulletEnv-v0" in refused("InvertedPendulmBulletEnv-v0")
-    assert refused("zzz") == "task.env_id=zzz is not a Gymnasium id; check its name and package."
+    assert refused("zzz") == (
+        "task.env_id=zzz is not a Gymnasium id; check its name, or name the module that registers "
+        "it: MODULE:ID."
+    )
+    assert refused("not_imported:Ball-v0") == (
+        "task.env_id=not_imported:Ball-v0 is not a Gymnasium id here: its module not_imported is "
+        "not imported; name it with imports=[not_imported] or --import not_imported, or import it."
+    )
+    assert refused("gymnasium:Ball-v0") == (
+        "task.env_id=gymnasium:Ball-v0 is not a Gymnasium id that gymnasium registers: check its "
+        "name."
+    )
 
 
 @pytest.mark.parametrize("env_id", ["CartPole-v99", "no_such_package:Walk-v0", "a b", "x/y/z", ""])

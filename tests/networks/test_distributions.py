@@ -1,8 +1,8 @@
 import pytest
 import torch
-from torch.distributions import Categorical, Independent, Normal
+from torch.distributions import Categorical, Independent, Normal, OneHotCategorical
 
-from giril_rl.networks.distributions import CategoricalActions, DiagonalGaussian
+from giril_rl.networks.distributions import CategoricalActions, DiagonalGaussian, OneHotActions
 
 
 def gaussian(*batch, size=3):
@@ -17,8 +17,13 @@ def categorical(*batch, size=4):
     return CategoricalActions(logits), Categorical(logits=logits), [logits]
 
 
+def one_hot(*batch, size=4):
+    logits = (3 * torch.randn(*batch, size)).requires_grad_()
+    return OneHotActions(logits), OneHotCategorical(logits=logits), [logits]
+
+
 @pytest.mark.parametrize("batch", [(), (7,), (2, 5)])
-@pytest.mark.parametrize("kind", [gaussian, categorical])
+@pytest.mark.parametrize("kind", [gaussian, categorical, one_hot])
 def test_log_prob_entropy_and_mode_are_torchs(kind, batch):
     ours, theirs, _ = kind(*batch)
     action = theirs.sample()
@@ -26,10 +31,23 @@ def test_log_prob_entropy_and_mode_are_torchs(kind, batch):
     torch.testing.assert_close(ours.log_prob(action), theirs.log_prob(action))
     torch.testing.assert_close(ours.entropy(), theirs.entropy())
     assert torch.equal(ours.mode, theirs.mode)
-    assert ours.sample().shape == action.shape and ours.sample().dtype == action.dtype
+    assert ours.sample().shape == action.shape
+    assert ours.sample().dtype == (action.dtype if kind is gaussian else torch.int64)
 
 
-@pytest.mark.parametrize("kind", [gaussian, categorical])
+def test_one_hot_draws_are_the_categoricals_of_the_same_random_numbers():
+    logits = torch.randn(50, 4)
+    torch.manual_seed(3)
+    index = CategoricalActions(logits).sample()
+    torch.manual_seed(3)
+    drawn = OneHotActions(logits).sample()
+    assert torch.equal(drawn, torch.nn.functional.one_hot(index, 4))
+    assert torch.equal(
+        OneHotActions(logits).log_prob(drawn.bool()), CategoricalActions(logits).log_prob(index)
+    )
+
+
+@pytest.mark.parametrize("kind", [gaussian, categorical, one_hot])
 def test_gradients_are_torchs(kind):
     *both, leaves = kind(6)
     action = both[1].sample()

@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 import torch
 
+from giril_rl.errors import UserError
 from giril_rl.networks.normalise import RunningNormaliser
 
 
@@ -60,6 +61,20 @@ def test_a_constant_dimension_stays_finite():
         normalise.update(torch.full((1000, 1), 3.0))
     assert normalise(torch.tensor([[3.0]])).abs().item() < 0.1
     assert normalise(torch.tensor([[4.0]])).item() == 10.0
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_what_is_not_finite_is_named_and_not_learned(value):
+    normalise = RunningNormaliser(3)
+    normalise.update(torch.randn(20, 3))
+    before = {name: kept.clone() for name, kept in normalise.state_dict().items()}
+    batch = torch.randn(4, 7, 3)  # Environments, time.
+    batch[2, 5, 1] = value
+    for learn in (normalise.update, normalise.fit):
+        with pytest.raises(UserError, match=rf"{value} at entry 1 of the one at \[2, 5\]"):
+            learn(batch)
+        for name, kept in normalise.state_dict().items():
+            assert torch.equal(kept, before[name])
 
 
 def test_using_it_is_not_learning_and_its_state_is_whole():

@@ -9,6 +9,7 @@ import pytest
 from giril_rl.cli import main
 from giril_rl.configs import TaskConfig
 from giril_rl.envs import GymVectorEnv, make_env
+from giril_rl.recipes import copy, find
 from giril_rl.training.checkpoint import load_state
 from giril_rl.training.metrics import read_metrics
 from giril_rl.training.run import Run
@@ -37,6 +38,25 @@ RESULT = {
 def root(tmp_path_factory):
     """Where this file's runs share one expert and one demonstration."""
     return tmp_path_factory.mktemp("runs")
+
+
+def test_a_copy_is_a_method_of_its_own_and_has_no_profile_where_nothing_is_averaged(root, tmp_path):
+    file, _ = copy(find("control"), tmp_path / "mine.py")
+    result = run(str(file), tmp_path / "random", root, "reward=random")
+    assert (result["method"], result["profile"]) == ("mine", None)
+    assert main(["eval", str(tmp_path / "random")]) == 0
+    result = run(str(file), tmp_path / "averaged", root)
+    assert (result["method"], result["profile"]) == ("mine", "released")
+    text = file.read_text()
+    averaging = "*([BatchMeanReward()] if cfg.batch_mean else []),"
+    assert averaging in text
+    text = text.replace("demo=demo,\n", 'demo=demo,\n            method="giril",\n')
+    file.write_text(text.replace(averaging, ""))
+    with pytest.warns(DeprecationWarning, match="method= is not read"):
+        result = run(str(file), tmp_path / "not_averaged", root)
+    assert (result["method"], result["profile"]) == ("mine", None)
+    card = json.loads((tmp_path / "not_averaged" / "policy" / "card.json").read_text())
+    assert (card["method"], card["profile"]) == ("mine", None)
 
 
 def run(recipe, out, root, *more, code=0):

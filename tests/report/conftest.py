@@ -53,6 +53,7 @@ def made(tmp_path):
             **lengths,
             "episodes": 20,
             "deterministic": {**lengths, "return_mean": score if mode is None else mode},
+            "demo_transitions": 1000 if has_demo else None,
             "expert_return_mean": 900.0 if has_demo else None,
             "demo_return_mean": 1000.0 if has_demo else None,
             "wall_seconds": 1.0,

@@ -11,6 +11,9 @@ from giril_rl.configs import DemoConfig, ExpertConfig, GenerativeConfig, PPOConf
 from giril_rl.demos import record_demonstration
 from giril_rl.envs import gym_factory, make_env
 from giril_rl.naming import config_hash
+from giril_rl.report.pictures import _is_generative
+from giril_rl.report.rows import panels_of
+from giril_rl.report.runs import read_runs
 from giril_rl.rewards import GenerativeReward
 from giril_rl.training import make_agent
 from giril_rl.training.expert import demonstration_place, expert_settings
@@ -45,11 +48,12 @@ def record(root, folder):
         read_part(folder, config, name, kind)
         for name, kind in (("demo", DemoConfig), ("expert", ExpertConfig))
     )
-    made_by = config_hash(expert_settings(RunConfig(task=task), expert))
+    cfg = RunConfig(task=task, seed=config["seed"])
+    made_by = config_hash(expert_settings(cfg, expert))
     recorded = record_demonstration(
         gym_factory(task), lambda seen: seen.new_zeros(1).long(), seed=0, length=9, lives="first"
     )
-    recorded.save(root / demonstration_place(task, demo, made_by))
+    recorded.save(root / demonstration_place(cfg, demo, made_by))
 
 
 def report(made, capsys):
@@ -63,22 +67,24 @@ def report(made, capsys):
 
 
 def test_the_lowest_seed_of_a_row_has_two_pictures(run, made, capsys):
-    record(made.root, run("giril", "seed=1"))
-    run("giril", "seed=2")
+    record(made.root, run("giril", "seed=1", "demo.path=null"))
+    run("giril", "seed=2", "demo.path=null")
     made("cdil", *WORDS, score=1.0)
     section, pictures = report(made, capsys)
-    name = "breakout-task.max_episode_steps=20-giril-released-49999872-seed1.png"
+    name = "breakout-task.max_episode_steps=20-giril-released-demo.path=null-49999872-seed1.png"
     assert sorted(pictures) == [f"predictions-{name}", f"reward-{name}"]
     assert re.findall(r"\]\((.*?)\)", section) == sorted(pictures)
     assert all(content.startswith(b"\x89PNG") for content in pictures.values())
-    about = r"^GIRIL \(released\), seed 1, 49,999,872 steps: `giril/breakout/task=.*,seed=1`; "
+    about = (
+        r"^GIRIL \(released\), seed 1, 49,999,872 steps `demo.path=null`: `giril/.*,seed=1,.*`; "
+    )
     assert re.search(about + r"a whole game of \d+ steps, seed 1000[0-4]\.$", section, re.M)
     assert "not in the folder" not in section
     assert report(made, capsys) == (section, pictures)
 
 
 def test_without_its_demonstration_a_run_shows_its_policy(run, made, capsys):
-    run("giril", "reward.beta=0.9")
+    run("giril", "reward.beta=0.9", "demo.path=null")
     section, pictures = report(made, capsys)
     assert len(pictures) == 2
     assert (
@@ -112,3 +118,15 @@ def test_vectors_have_no_pictures(made, capsys):
     made("giril", score=1.0)
     section, pictures = report(made, capsys)
     assert not section and not pictures
+
+
+def test_of_recipes_of_ones_own_those_with_a_generative_model_have_pictures(run, made):
+    for recipe in ("giril", "cdil"):
+        folder = run("giril") if recipe == "giril" else made(recipe, *WORDS, score=1.0)
+        config = folder / "config.yaml"
+        config.write_text(config.read_text().replace(f"recipe: {recipe}", f"recipe: my_{recipe}"))
+    (panel,) = panels_of(read_runs(made.root)[0])
+    assert {row.method: _is_generative(row) for row in panel.rows} == {
+        "my_cdil": False,
+        "my_giril": True,
+    }

@@ -18,6 +18,7 @@ def runs(made):
         made("giril", f"seed={seed}", score=900.0 + seed, mode=800.0)
         made("giril", f"seed={seed}", "reward.beta=0.9", score=700.0 + seed)
         made("control", f"seed={seed}", score=500.0)
+        made("control", f"seed={seed}", "reward=random", score=10.0 + 10 * seed)
         made("bc", f"seed={seed}", score=300.0)
     made("giril", "task=inverted_double_pendulum", score=4000.0, demo_return_mean=9000.0)
     made("expert", score=950.0)
@@ -32,17 +33,23 @@ def report(made, capsys, code=0):
 
 def test_tables_and_pictures(runs, capsys):
     out, captured = report(runs, capsys)
-    assert captured.out == f"14 finished runs in 3 tables: {out}/report.md\n"
+    assert captured.out == f"17 finished runs in 3 tables: {out}/report.md\n"
     text = (out / "report.md").read_text()
     assert "## inverted_pendulum: results\n\n3 seeds, 300,000 environment steps." in text
-    assert "Scores of the demonstration 1,000.0 and of the expert 900.0." in text
+    scores = "demonstration 1,000.0, of the expert 900.0 and of the random policy 20.0."
+    assert f"Scores of the {scores}" in text
+    missing = "Not normalised: a run of the random policy is missing; `giril run control "
+    missing += f"task=inverted_double_pendulum reward=random root={runs.root}` makes one."
+    assert text.count("Not normalised") == 1 and missing in text
     assert "Paper: Table 5, 10,000,000 steps, 3 seeds." in text
     line = (
-        "| GIRIL (released) | 3 | 300,000 | 901.0 [900.0, 902.0] | 901.0 [900.0, 902.0] | 800.0 "
+        "| **GIRIL (released)** | 3 | 300,000 | **901.0 [900.0, 902.0]** | 1.00 [1.00, 1.00] "
         "| 1.00 [1.00, 1.00] | 990.2 | 900.0 901.0 902.0 |"
     )
     assert line in text
-    assert "| BC | 3 | 0 | 300.0 [300.0, 300.0] |" in text
+    # (300 - 20) / (900 - 20) = 0.318, and the random policy's own is 0.
+    assert "| BC | 3 | 0 | 300.0 [300.0, 300.0] | 0.32 [0.32, 0.32] |" in text
+    assert "| control: random | 3 | 0 | 20.0 [10.0, 30.0] | 0.00 [-0.01, 0.01] | - | - |" in text
     assert "β = 0.9 | 3 | 300,000 | 701.0" in text
     pictures = {path.name: path.read_bytes() for path in out.glob("*.png")}
     assert set(pictures) == {
@@ -78,37 +85,67 @@ def test_csv_has_unrounded_numbers(runs, capsys):
         "control: constant",
     )
     each = list(csv.DictReader((out / "runs.csv").open()))
-    assert len(each) == 14
+    assert len(each) == 17
     assert {row["state"] for row in each} == {"finished"}
     (one,) = [row for row in each if row["folder"] == "giril/inverted_pendulum/seed=1"]
     assert (one["seed"], one["reward_seed"], one["return_mean"]) == ("1", "101", "901.0")
 
 
 def test_all_tasks_together(made, capsys):
-    for task, demo in (("inverted_pendulum", 1000.0), ("inverted_double_pendulum", 9000.0)):
+    # Halfway from the random policy's to the player's, whatever the signs of the two.
+    for task, low, high in (
+        ("inverted_pendulum", 100.0, 900.0),
+        ("inverted_double_pendulum", -1200.0, -200.0),
+    ):
         for seed in range(2):
             words = (f"task={task}", f"seed={seed}")
-            made("giril", *words, score=demo / 2, demo_return_mean=demo)
+            made("giril", *words, score=(low + high) / 2, expert_return_mean=high)
+            made("control", *words, "reward=random", score=low)
             if task == "inverted_pendulum":
                 made("control", *words, score=500.0)
     out, _ = report(made, capsys)
     text = (out / "report.md").read_text()
     assert "| GIRIL (released) | 2 | 0.50 [0.50, 0.50] | 0.50 [0.50, 0.50] |" in text
+    assert "inverted_double_pendulum (random policy -1,200.0, player -200.0, " in text
     assert "Not on every task, and so not here: control: constant." in text
 
 
 def test_without_training_episodes_there_are_no_curves(made, capsys):
     made("bc", score=300.0)
+    made("control", "reward=random", score=100.0)
     out, _ = report(made, capsys)
     assert [path.name for path in out.glob("*.png")] == ["normalised.png"]
-    assert "| BC | 1 | 0 | 300.0 |" in (out / "report.md").read_text()
+    assert "| BC | 1 | 0 | 300.0 | 0.25 | 36.0 | 300.0 |" in (out / "report.md").read_text()
 
 
-def test_a_demonstration_without_a_positive_score_has_no_bars(made, capsys):
+def test_without_a_random_policy_there_are_no_bars(made, capsys):
     made("giril", score=-5.0, demo_return_mean=-2.0)
     out, _ = report(made, capsys)
     assert not (out / "normalised.png").exists()
-    assert "normalised.png" not in (out / "report.md").read_text()
+    text = (out / "report.md").read_text()
+    assert "normalised.png" not in text and "Not normalised: " in text
+
+
+def test_the_top_names_what_made_the_runs_and_their_origins_stand_beside_them(made, capsys):
+    versions = {"giril_rl": "0.2.0", "torch": "2.13.0", "torchrl": "0.14.1", "pybullet": None}
+    for seed in range(2):
+        origin = {"demo": f"shipped:pole/{seed}", "demo_id": f"d{seed}"}
+        made("giril", f"seed={seed}", score=500.0, versions=versions, processor="A B1", **origin)
+    older = {**versions, "giril_rl": "0.1.0"}
+    made("control", "reward=random", score=100.0, versions=older, processor="A B1")
+    out, _ = report(made, capsys)
+    head = (out / "report.md").read_text().splitlines()[2]
+    assert head == (
+        "3 finished runs, made with giril-rl 0.1.0 (1 run) and 0.2.0 (2 runs), torch 2.13.0, "
+        "torchrl 0.14.1; processor: A B1."
+    )
+    rows = list(csv.DictReader((out / "runs.csv").open()))
+    keys = ("demo", "demo_id", "expert_return_mean", "demo_return_mean", "normalised")
+    assert sorted(tuple(row[key] for key in keys) for row in rows) == [
+        ("", "", "", "", "0.0"),
+        ("shipped:pole/0", "d0", "900.0", "1000.0", "0.5"),
+        ("shipped:pole/1", "d1", "900.0", "1000.0", "0.5"),
+    ]
 
 
 def test_runs_without_a_result_are_listed(runs, capsys):
@@ -126,7 +163,7 @@ def test_runs_without_a_result_are_listed(runs, capsys):
     entries = [dict(zip(("folder", "state", "last_line"), row, strict=True)) for row in rows]
     (folder / "status.json").write_text(json.dumps({"runs": entries}))
     out, captured = report(runs, capsys)
-    assert captured.out.startswith("14 finished runs in 3 tables, 4 without a result: ")
+    assert captured.out.startswith("17 finished runs in 3 tables, 4 without a result: ")
     text = (out / "report.md").read_text()
     place = "giril/inverted_pendulum"
     assert text.split("## Without a result")[1].strip().splitlines() == [
@@ -138,7 +175,7 @@ def test_runs_without_a_result_are_listed(runs, capsys):
         f"| `{place}/seed=9` | failed | 300,000 of 300,000 | RuntimeError: a \\| b |",
     ]
     states = [row["state"] for row in csv.DictReader((out / "runs.csv").open())]
-    assert states.count("finished") == 14 and states.count("failed") == 1
+    assert states.count("finished") == 17 and states.count("failed") == 1
 
 
 def test_a_folder_without_finished_runs_is_refused(made, capsys):
@@ -205,9 +242,9 @@ def test_no_curve_is_cut_off(made, drawn, tmp_path):
     made("giril", "reward.prior=conditional", "steps=2000000", score=1.0)
     made("control", "steps=1000000", score=1.0)
     assert main(["report", str(made.root), "--out", str(tmp_path / "out")]) == 0
-    limits = [[axes.get_xlim()[1] for axes in figure.axes] for figure in drawn[1:]]
+    limits = [[axes.get_xlim()[1] for axes in figure.axes] for figure in drawn]
     assert limits == [[1_050_000, 1_050_000], [2_100_000]]
-    labels = [text.get_text() for text in drawn[2].axes[0].get_legend().get_texts()]
+    labels = [text.get_text() for text in drawn[1].axes[0].get_legend().get_texts()]
     assert labels[1:3] == [
         "reward.prior=conditional, 300,000 steps, n = 1",
         "reward.prior=conditional, 2,000,000 steps, n = 1",
@@ -234,7 +271,7 @@ def test_a_value_has_one_colour_in_all_parts_of_a_picture(made, drawn, tmp_path)
     assert len({found[0] for found in colours.values()}) == 2
 
 
-def test_games_have_life_length_and_speed(made, capsys):
+def test_games_have_life_length_and_speed_in_the_csv(made, capsys):
     for seed, length in ((0, 50.0), (1, 70.0)):
         made(
             "control",
@@ -246,6 +283,6 @@ def test_games_have_life_length_and_speed(made, capsys):
         )
     out, _ = report(made, capsys)
     text = (out / "report.md").read_text()
-    assert "| life length | steps/s |" in text and "| 60.0 | 500.0 |" in text
+    assert "life length |" not in text  # It is in the CSV: a table has few columns.
     rows = list(csv.DictReader((out / "results.csv").open()))
     assert [(row["life_length"], row["steps_per_second"]) for row in rows] == [("60.0", "500.0")]

@@ -6,6 +6,7 @@ import yaml
 from giril_rl.report.formats import seeds_text
 from giril_rl.report.rows import panels_of
 from giril_rl.report.runs import read_runs
+from giril_rl.report.style import PALETTE
 from giril_rl.report.tables import tables_of
 
 
@@ -39,22 +40,20 @@ def test_methods_profiles_budgets_and_settings_make_rows_of_their_own(made):
     made("giril", "profile=paper", score=2.0)
     made("giril", "steps=1000000", score=3.0)
     made("giril", "reward.prior=conditional", "ppo.clip=0.2", score=4.0)
-    made("giril", "batch_mean=false", score=5.0)
+    made("giril", "batch_mean=false", "seed=1", score=5.0)  # The paper's, by another name.
     made("control", score=6.0)
     found = {key: row.scores for key, row in rows(made).items()}
     assert found == {
         ("GIRIL (released)", "", 300_000): [1.0],
-        ("GIRIL (paper)", "", 300_000): [2.0],
+        ("GIRIL (paper)", "", 300_000): [2.0, 5.0],
         ("GIRIL (released)", "", 1_000_000): [3.0],
         ("GIRIL (released)", "ppo.clip=0.2 reward.prior=conditional", 300_000): [4.0],
-        ("GIRIL (released)", "batch_mean=false", 300_000): [5.0],
         ("control: constant", "", 300_000): [6.0],
     }
     # An unknown difference has a line of its own, beside the recipe's own settings.
     lines = [(line.row.name, line.value) for line in tables(made)["other"].lines]
     assert lines == [
         ("GIRIL (released)", "the recipe's own"),
-        ("GIRIL (released)", "batch_mean=false"),
         ("GIRIL (released)", "ppo.clip=0.2 reward.prior=conditional"),
     ]
 
@@ -123,11 +122,64 @@ def test_a_key_that_the_recipe_does_not_know_is_a_difference(made):
 
 def test_runs_of_an_unknown_recipe_are_compared_with_one_another(made):
     for seed, clip in ((0, 0.1), (1, 0.1), (2, 0.3)):
-        folder = made("giril", f"seed={seed}", f"ppo.clip={clip}", score=1.0, method="mine")
-        text = (folder / "config.yaml").read_text()
-        (folder / "config.yaml").write_text(text.replace("recipe: giril", "recipe: mine"))
+        made("giril", f"seed={seed}", f"ppo.clip={clip}", score=1.0, extra={"recipe": "mine"})
     found = {row.settings: row.seeds for row in rows(made).values()}
     assert found == {"": [0, 1], "ppo.clip=0.3": [2]}
+
+
+def test_a_recipe_of_ones_own_is_a_method_beside_the_shipped_ones(made):
+    made("giril", score=1.0)
+    made("giril", "ppo.clip=0.1", score=2.0, extra={"recipe": "mine"})  # Its result says giril.
+    made("bc", "eval.seed=10000", score=3.0, extra={"recipe": "GAIL"}, profile=None)
+    made("gail", score=4.0)
+    made("control", "reward=copy", score=5.0, extra={"recipe": "other"})
+    made("control", "reward=noise", "seed=1", score=6.0, extra={"recipe": "other"})
+    (panel,) = panels(made)
+    assert panel.repeats == []
+    assert {(row.name, row.settings): row.scores for row in panel.rows} == {
+        ("GIRIL (released)", ""): [1.0],
+        ("GAIL", ""): [4.0],
+        ("GAIL (own)", ""): [3.0],
+        ("mine (released)", ""): [2.0],
+        ("other (released)", ""): [5.0],
+        ("other (released)", "reward=noise"): [6.0],
+    }
+    table = tables(made)["results"]
+    assert len(table.lines) == 5 and [line.row.scores for line in table.best] == [[5.0]]
+    colours = [row.look.color for row in panel.main]
+    assert len(set(colours)) == 5
+    assert not set(colours[2:]) & set(PALETTE)  # Of no shipped method, in any picture.
+
+
+def test_a_runs_settings_name_no_file_that_is_run(made, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "theirs.py").write_text('"""A recipe."""\nraise SystemExit("it was run")\n')
+    (tmp_path / "theirs.yaml").write_text("defaults: [recipe_schema]\n")
+    made("giril", score=1.0, extra={"recipe": "theirs.py"})
+    assert [row.name for row in panels(made)[0].rows] == ["theirs.py (released)"]
+
+
+def test_the_demonstration_follows_the_seed_and_a_given_one_is_a_row(made):
+    for seed in range(3):
+        made("giril", f"seed={seed}", score=1.0, demo_id=f"d{seed}", demo=f"shipped:pole/{seed}")
+    made("giril", "demo.path=mine", score=2.0, demo_id="d9", demo="mine")
+    made("bc", score=3.0)
+    found = {(row.name, row.settings): row.seeds for row in rows(made).values()}
+    assert found == {
+        ("GIRIL (released)", ""): [0, 1, 2],
+        ("GIRIL (released)", "demo.path=mine"): [0],
+        ("BC", ""): [0],
+    }
+
+
+def test_controls_are_not_told_apart_by_what_they_do_not_read(made):
+    made("giril", "demo.path=mine", "ppo.lr=0.1", score=1.0)
+    made("bc", "demo.path=mine", "ppo.lr=0.1", score=1.0)
+    made("control", "ppo.lr=0.1", score=2.0)  # A constant has no demonstration,
+    made("control", "reward=random", score=3.0)  # and a random policy trains nothing.
+    (panel,) = panels(made)
+    assert panel.shared == (("demo.path", "mine"), ("ppo.lr", "0.1"))
+    assert len(panel.main) == 4
 
 
 def test_what_all_runs_share_is_the_panels_and_no_rows(made):
@@ -135,12 +187,14 @@ def test_what_all_runs_share_is_the_panels_and_no_rows(made):
     made("giril", "ppo.clip=0.2", "reward.beta=0.9", score=2.0)
     made("control", "ppo.clip=0.2", score=3.0)
     made("expert", score=4.0)
+    made("gail", "ppo.clip=0.2", score=5.0, extra={"recipe": "mine"}, profile=None)
     (panel,) = panels(made)
     assert panel.shared == (("ppo.clip", "0.2"),)
     assert [(row.name, row.settings) for row in panel.rows] == [
         ("expert", ""),
         ("GIRIL (released)", ""),
         ("GIRIL (released)", "reward.beta=0.9"),
+        ("mine", ""),
         ("control: constant", ""),
     ]
 

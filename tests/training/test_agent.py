@@ -1,10 +1,19 @@
+from types import SimpleNamespace
+
 import pytest
 import torch
+from tensordict import TensorDict
+from torchrl.data import Bounded, Categorical, OneHot, Unbounded
+from torchrl.envs import GymEnv
 
 from giril_rl.configs import PPOConfig, TaskConfig
 from giril_rl.envs import make_env
 from giril_rl.errors import UserError
+from giril_rl.networks.agents import agent_for, check_actions, fits
+from giril_rl.networks.pixel_policy import PixelActorCritic
+from giril_rl.networks.policy import ActorCritic
 from giril_rl.training.agent import load_agent, make_agent
+from giril_rl.training.evaluate import evaluate
 
 CARTPOLE = TaskConfig(name="cartpole", env_id="CartPole-v1")
 CFG = PPOConfig(hidden=[16])
@@ -40,3 +49,40 @@ def test_a_missing_or_foreign_policy_is_refused(tmp_path):
         load_agent(tmp_path, TaskConfig(name="pendulum", env_id="Pendulum-v1"))
     with pytest.raises(UserError, match="does not fit mountain_car"):
         load_agent(tmp_path, TaskConfig(name="mountain_car", env_id="MountainCar-v0"))
+
+
+def test_an_agent_has_the_encoding_of_its_environment():
+    integers, one_hot = make_env(CARTPOLE, 2, seed=0), GymEnv("CartPole-v1")
+    for env, other in ((integers, one_hot), (one_hot, integers)):
+        agent = agent_for(env, hidden=(8,), normalise=True)
+        assert fits(agent, env) and not fits(agent, other)
+        assert env.rollout(3, agent.acting())["action"].dtype == env.action_spec.dtype
+        with pytest.raises(UserError, match="made for actions"):
+            check_actions(agent, other)
+    with pytest.raises(UserError, match=r"made for actions .*one_hot.* has .*discrete"):
+        evaluate(ActorCritic(4, OneHot(2)), CARTPOLE, episodes=1, seed=0, deterministic=True)
+
+
+def test_agents_of_frames_have_it_as_well():
+    frames = Unbounded((2, 4, 84, 84), dtype=torch.uint8)
+    integers, one_hot = (
+        SimpleNamespace(observation_spec={"observation": frames}, action_spec=spec, batch_dims=1)
+        for spec in (Categorical(3, shape=(2,)), OneHot(3, shape=(2, 3)))
+    )
+    for env, other in ((integers, one_hot), (one_hot, integers)):
+        agent = agent_for(env, hidden=(), normalise=True)
+        assert fits(agent, env) and not fits(agent, other)
+    assert fits(PixelActorCritic(3), integers) and fits(PixelActorCritic(Categorical(3)), integers)
+    shown = TensorDict({"observation": torch.zeros(2, 4, 84, 84, dtype=torch.uint8)}, [2])
+    assert agent.acting()(shown)["action"].sum(-1).tolist() == [1, 1]
+    with pytest.raises(UserError, match="discrete actions"):
+        PixelActorCritic(Bounded(-1, 1, shape=(1,)))
+
+
+def test_actions_of_more_dimensions_are_refused():
+    spec = Bounded(-1, 1, shape=(2, 3))
+    env = SimpleNamespace(
+        observation_spec={"observation": Unbounded(4)}, action_spec=spec, batch_dims=0
+    )
+    with pytest.raises(UserError, match=r"shape \(2, 3\) .* is not supported"):
+        agent_for(env, hidden=(), normalise=True)

@@ -4,7 +4,8 @@ import pytest
 import torch
 import torch.nn.functional as F
 from tensordict import TensorDict
-from torchrl.data import Bounded, Categorical
+from torchrl.data import Bounded, Categorical, OneHot
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from giril_rl.configs import BCConfig
 from giril_rl.errors import UserError
@@ -29,6 +30,10 @@ def pairs(n, seed=0, *, noise=0.0, spec=BOX):
         return TensorDict({"observation": state, "action": scores.argmax(-1)}, [n])
     action = state @ GAIN + noise * torch.randn(n, 2, generator=generator)
     return TensorDict({"observation": state, "action": action}, [n])
+
+
+def one_hot(data):
+    return F.one_hot(data["action"], 3)
 
 
 def make_agent(spec=BOX, hidden=(16,), **kwargs):
@@ -73,6 +78,24 @@ def test_a_linear_expert_is_recovered_from_aligned_pairs(tmp_path):
     )
 
 
+def test_bounds_give_the_units(tmp_path):
+    """Thousands and hundredths, off centre: the very same fit, in units of half the range."""
+    plain, rows = cloned(tmp_path / "plain", pairs(40, noise=0.1), stop="fixed", min_std=0.2)
+    low, high = torch.tensor([-2000.0, 0.5]), torch.tensor([2000.0, 0.75])
+    agent = make_agent(Bounded(low, high))
+    fitted = pairs(40, noise=0.1)
+    fitted["action"] = (low + high) / 2 + (high - low) / 2 * fitted["action"]
+    _, scaled_rows = cloned(tmp_path / "scaled", fitted, agent=agent, stop="fixed", min_std=0.2)
+    for name, value in plain.state_dict().items():
+        torch.testing.assert_close(agent.state_dict()[name], value, atol=1e-4, rtol=0)
+    assert scaled_rows[-1]["bc/fitted/loss"] == pytest.approx(rows[-1]["bc/fitted/loss"], rel=1e-3)
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        played = agent.acting()(fitted.clone())["action"]
+    expected = mean_action(plain, fitted["observation"]).clamp(-1, 1)
+    expected = (low + high) / 2 + (high - low) / 2 * expected
+    torch.testing.assert_close(played, expected, atol=0.0, rtol=1e-3)
+
+
 def test_actions_one_step_late_are_not_recovered(tmp_path):
     """The fault that the paper's loader had: the same pairs with labels of their neighbours."""
     late = pairs(40)
@@ -91,6 +114,15 @@ def test_discrete_actions_are_recovered(tmp_path):
     assert hits.float().mean() > 0.9
     assert rows[-1]["bc/fitted/loss"] < 0.2 < rows[0]["bc/fitted/loss"]
     assert agent.log_std is None
+    # To a policy of one-hot actions the same is taught by integers, as demonstrations have them.
+    for number, given in enumerate((fitted, fitted.clone().set("action", one_hot(fitted)))):
+        other, _ = cloned(
+            tmp_path / f"{number}", given, stop="fixed", steps=20, agent=make_agent(OneHot(3))
+        )
+        same_steps, _ = cloned(
+            tmp_path / f"{number}b", fitted, stop="fixed", steps=20, spec=DISCRETE
+        )
+        assert same(other, same_steps)
 
 
 @pytest.mark.parametrize("spec", [BOX, DISCRETE], ids=["box", "discrete"])

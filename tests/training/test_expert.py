@@ -36,7 +36,7 @@ def obtain(monkeypatch, tmp_path):
     monkeypatch.setattr(expert, "load_agent", lambda *_: Random(actions=4))
 
     def obtain(task, demo):
-        config = RunConfig(task=task, root=str(tmp_path))
+        config = RunConfig(task=task, root=str(tmp_path), steps=2000)
         found, _ = obtain_demonstration(config, ExpertConfig(), demo)
         return found, {path.parent for path in tmp_path.glob("demos/*/*/card.json")}
 
@@ -73,7 +73,7 @@ def test_a_given_demonstration_must_fit_the_task(obtain, tmp_path):
     pytest.importorskip("ale_py")
     _, (folder,) = obtain(BREAKOUT, LIFE)
     given = DemoConfig(path=str(folder))
-    config = RunConfig(task=BREAKOUT, root=str(tmp_path))
+    config = RunConfig(task=BREAKOUT, root=str(tmp_path), steps=2000)
     check_inputs(config, ExpertConfig(), given)
     demo, result = obtain_demonstration(config, ExpertConfig(), given)
     assert result == {"return_mean": demo.card["expert"]["return_mean"]} and demo.has_images

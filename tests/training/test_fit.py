@@ -64,6 +64,11 @@ def test_the_losses_fall_on_fitted_and_held_out_data(kind, tmp_path):
         assert total[-1] < 0.8 * total[0]
 
 
+def test_how_often_losses_are_logged_changes_nothing_else(tmp_path):
+    one, other = (fitted(tmp_path / str(every), log_every=every) for every in (7, 60))
+    assert same(one[0], other[0]) and len(one[1]) > len(other[1])
+
+
 def test_held_out_data_are_logged_and_never_fitted(tmp_path):
     held_out = transitions(50, seed=9)
     weights, rows = fitted(tmp_path / "a", held_out=held_out)

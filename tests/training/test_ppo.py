@@ -7,10 +7,13 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torch import nn
+from torchrl.data import Bounded, Categorical, OneHot
 from torchrl.envs import Compose
 
 from giril_rl.configs import PPOConfig, TaskConfig
 from giril_rl.envs import GymVectorEnv, make_env
+from giril_rl.errors import UserError
+from giril_rl.networks.pixel_policy import PixelActorCritic
 from giril_rl.networks.policy import NORMALISED, ActorCritic
 from giril_rl.rewards import GenerativeReward
 from giril_rl.training.agent import make_agent
@@ -173,6 +176,64 @@ def test_the_first_minibatch_has_ratio_one():
     assert abs(losses["kl_approx"]) < 1e-6
     # With ratio 1 the objective is minus the mean normalised advantage, which is 0.
     assert abs(losses["loss_objective"]) < 1e-5
+
+
+class InUnits(gymnasium.ActionWrapper):
+    """The same environment with actions in [-2048, 2048], a power of two, so that bits stay."""
+
+    def __init__(self, env):
+        super().__init__(env)
+        self.action_space = gymnasium.spaces.Box(-2048.0, 2048.0, (1,))
+
+    def action(self, action):
+        return action / 2048
+
+
+@pytest.mark.parametrize("normalise", [True, False])
+def test_units_of_the_action_do_not_matter(step_counter, normalise, tmp_path):
+    def trained(wrapper, name):
+        env = GymVectorEnv(lambda: wrapper(step_counter()), 4)
+        agent = make_agent(env, config(normalise_observations=normalise), seed=0)
+        with Run.open(tmp_path / name, {}, recipe="x") as run:
+            train_ppo(env, agent, Compose(), config(), steps=3 * BATCH, seed=0, run=run)
+        return agent.state_dict()
+
+    assert_equal(dict(trained(InUnits, "b")), dict(trained(lambda env: env, "a")))
+
+
+@pytest.mark.parametrize("pixels", [False, True])
+def test_one_hot_actions_are_learned_as_integers_are(pixels):
+    """The same weights from the same data, for all that the encoding differs."""
+    learned = []
+    for spec in (Categorical(3), OneHot(3)):
+        torch.manual_seed(0)
+        agent = PixelActorCritic(spec) if pixels else ActorCritic(3, spec, hidden=(8,))
+        shape = (4, 84, 84) if pixels else (3,)
+        observed = torch.randint(256, (2, 3, *shape), dtype=torch.uint8)
+        data = TensorDict({"observation": observed if pixels else observed / 99.0}, [2, 3])
+        torch.manual_seed(1)
+        data = agent.acting()(data)
+        assert data["action"].shape == (2, 3, *spec.shape)
+        false = torch.zeros(2, 3, 1, dtype=torch.bool)
+        data["next"] = {
+            "observation": data["observation"].roll(-1, 1),
+            "reward": torch.randn(2, 3, 1),
+            **dict.fromkeys(("done", "terminated"), false),
+        }
+        cfg = PPOConfig(minibatch=3, epochs=2, lr=0.01)
+        PPOLearner(agent, cfg, total_steps=1000).learn(data, 0)
+        learned.append(dict(agent.state_dict()))
+    assert_equal(*learned)
+
+
+def test_an_agent_made_for_other_actions_is_refused(step_counter, tmp_path):
+    env = GymVectorEnv(lambda: InUnits(step_counter()), 4)
+    agent = ActorCritic(3, Bounded(-1, 1, shape=(1,)))
+    with (
+        Run.open(tmp_path, {}, recipe="x") as run,
+        pytest.raises(UserError, match=r"made for actions .*-1.* environment has .*-2048"),
+    ):
+        train_ppo(env, agent, Compose(), config(), steps=BATCH, seed=0, run=run)
 
 
 def test_the_normaliser_learns_after_the_update_has_used_it():

@@ -3,11 +3,11 @@ import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.data import Bounded, Categorical, Unbounded
+from torchrl.data import Bounded, Categorical, MultiCategorical, OneHot, Unbounded
 
 from giril_rl.configs import TaskConfig
 from giril_rl.errors import UserError
-from giril_rl.training import RandomPolicy
+from giril_rl.training import HeldAction, RandomPolicy
 from giril_rl.training.evaluate import evaluate
 
 CARTPOLE = TaskConfig(name="cartpole", env_id="CartPole-v1")
@@ -32,8 +32,21 @@ def test_uniform_over_classes():
 
 
 def test_refuses_actions_without_bounds():
-    with pytest.raises(UserError, match="no uniform distribution"):
-        RandomPolicy(Unbounded((2, 1)))
+    for spec in (Unbounded((2, 1)), Bounded(0.0, float("inf"), shape=(2, 1))):
+        with pytest.raises(UserError, match="no uniform distribution"):
+            RandomPolicy(spec)
+    with pytest.raises(UserError, match="is not supported"):
+        RandomPolicy(MultiCategorical([2, 3], shape=(1, 2)))
+
+
+def test_one_action_of_any_encoding_is_held():
+    for spec, action in ((Categorical(3, shape=(2,)), 2), (OneHot(3, shape=(2, 3)), [0, 0, 1])):
+        held = HeldAction(spec, 2)(TensorDict(batch_size=[2, 4]))["action"]
+        assert torch.equal(held, torch.tensor(action).expand(held.shape))
+        assert held.shape[:2] == (2, 4) and held.dtype == torch.int64
+    for spec in (MultiCategorical([2, 3]), Bounded(0, 3, shape=(1,), dtype=torch.int64)):
+        with pytest.raises(UserError, match="is not supported"):
+            HeldAction(spec, 0)
 
 
 def test_its_score_is_that_of_random_play():

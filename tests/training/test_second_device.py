@@ -14,8 +14,11 @@ from giril_rl.configs import AdversarialConfig, PPOConfig
 from giril_rl.networks.pixel_policy import PixelActorCritic
 from giril_rl.networks.policy import ActorCritic
 from giril_rl.rewards import (
+    AffineReward,
     BottleneckLoss,
     BottleneckReward,
+    ConstantReward,
+    CopyReward,
     CuriosityReward,
     CuriosityRewardLoss,
     DiscriminatorLoss,
@@ -23,6 +26,7 @@ from giril_rl.rewards import (
     GenerativeReward,
     GenerativeRewardLoss,
     ObservationScaler,
+    PixelScaler,
 )
 from giril_rl.rewards.fitting import fit
 from giril_rl.training import AdversarialLearner
@@ -134,7 +138,7 @@ def test_training_a_discriminator(cls, loss, penalty, kind):
 def test_a_step_of_ppo(kind):
     agent = agent_for(kind)
     learner = PPOLearner(agent, PPOConfig(clip_value=True, entropy_coef=0.01), total_steps=8)
-    rows = {"action": transitions(kind, 8)["action"], agent.input_keys[0]: torch.randn(8, 3)}
+    rows = {agent.drawn_key: transitions(kind, 8)["action"], agent.input_keys[0]: torch.randn(8, 3)}
     if kind == "pixels":
         rows[agent.input_keys[0]] = agent.actor.deal(observations(kind, 8))
     scalars = ("advantage", "value_target", "state_value")
@@ -152,6 +156,9 @@ def test_acting_relabelling_and_learning(kind, termination, monkeypatch):
     """A batch as :func:`giril_rl.training.train_ppo` goes through it."""
     # TorchRL asks once a batch whether an observation is NaN, and would copy it.
     monkeypatch.setattr(GAE, "_sanitize_next_obs_nan", staticmethod(lambda data, in_keys: data))
+    # As do the running normalisation and the scaling of returns.
+    monkeypatch.setattr("giril_rl.networks.normalise._check_finite", lambda observation: None)
+    monkeypatch.setattr("giril_rl.transforms.scaling._finite", lambda value: True)
     agent = agent_for(kind)
     reward = made(GenerativeReward, kind).eval()
     relabel = Compose(IntrinsicReward(reward), BatchMeanReward(), ReturnScaling())
@@ -173,18 +180,28 @@ def test_acting_relabelling_and_learning(kind, termination, monkeypatch):
         learner.optimizer = torch.optim.Adam(learner.gradients.parameters)
         acted = agent.acting()(batch.apply(device.mode.from_tensor))
         assert {x.device.type for x in acted.values(True, True)} == {"cpu"}
-        moved = relabel(acted.to(DEVICE))
-        moved = relabel(moved)  # What was kept from the first batch is not looked at.
+        collected = acted.to(DEVICE)
+        relabel(collected)
+        moved = relabel(collected)  # What was kept from the first batch is not looked at.
         assert moved["next", "reward"].device == DEVICE
         assert "loss_critic" in learner.learn(moved, 0)
 
 
-def test_a_reward_elsewhere_than_its_batch(kind):
+@pytest.mark.parametrize("reward", ["weights", "buffers", "neither"])
+@pytest.mark.parametrize("true", [True, False])
+def test_a_reward_elsewhere_than_its_batch(kind, reward, true):
     """An environment on the CPU may have a reward on a GPU."""
-    reward = made(GenerativeReward, kind).eval()
-    relabel = IntrinsicReward(reward)
+    scaler = ObservationScaler(3).fit(torch.randn(20, 3)) if kind == "vectors" else PixelScaler()
+    rewards = {
+        "weights": lambda: made(GenerativeReward, kind).eval(),
+        "buffers": lambda: AffineReward(CopyReward(scaler), shift=1.0),
+        "neither": ConstantReward,
+    }
+    module = rewards[reward]()
+    relabel = IntrinsicReward(module, extrinsic_key="extrinsic_reward" if true else None)
     batch = transitions(kind, ENVS, TIME)
-    batch["next", "reward"] = torch.ones(ENVS, TIME, 1)
+    if true:
+        batch["next", "reward"] = torch.ones(ENVS, TIME, 1)
     with second_device(values=True) as device:
         device.take(relabel)
         relabelled = relabel(batch.apply(device.mode.from_tensor))

@@ -19,11 +19,11 @@ LOG = ("kl_approx", "clip_fraction")
 class PPO:
     """ClipPPOLoss as the learner uses it, and batches for it."""
 
-    keys = (NORMALISED, *LEARNER_KEYS)
     log = LOG
 
     def __init__(self, kind):
         self.agent = ActorCritic(4, SPECS[kind], hidden=(16, 16))
+        self.keys = (NORMALISED, self.agent.drawn_key, *LEARNER_KEYS)
         with torch.no_grad():
             for parameter in self.agent.parameters():
                 parameter.add_(0.2 * torch.randn_like(parameter))

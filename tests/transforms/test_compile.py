@@ -37,3 +37,8 @@ def test_one_graph_with_the_same_numbers(backend):
         except InductorError as error:
             pytest.skip(f"no compiler for torch.compile here: {error}")
         torch.testing.assert_close(out, expected, rtol=1e-5, atol=1e-6)
+    before = {name: value.clone() for name, value in compiled.state_dict().items()}
+    spoilt = batch()
+    spoilt["observation"][1, 3] = float("nan")
+    assert compiled(spoilt)["next", "reward"].isnan().all()  # A graph cannot refuse it.
+    assert all(torch.equal(value, before[name]) for name, value in compiled.state_dict().items())

@@ -6,6 +6,7 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.collectors import Collector
+from torchrl.collectors.utils import split_trajectories
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import Compose, RewardSum, SerialEnv, StepCounter, TransformedEnv
 from torchrl.envs.utils import check_env_specs
@@ -160,9 +161,10 @@ def test_eval_mode_no_gradient_and_flags_restored(counter_env, policy):
     transform = IntrinsicReward(
         TensorDictModule(spy, [("next", "observation")], [("next", "intrinsic_reward")])
     )
-    data = transform(rollout(counter_env(), policy()))
+    data = rollout(counter_env(), policy())
+    relabelled = transform(data)
     assert spy.seen == [(False, False, False)]
-    assert not data["next", "reward"].requires_grad
+    assert not relabelled["next", "reward"].requires_grad
     assert spy.training and spy.linear.training and not spy.frozen.training
     # Attaching it to an environment does not interfere with the module's training either.
     TransformedEnv(counter_env(), Compose(StepCounter(), transform)).rollout(3)
@@ -216,6 +218,46 @@ def test_demonstration_without_reward():
         IntrinsicReward(ConstantReward())(data)
 
 
+def test_a_true_reward_that_is_kept_already_is_not_lost(counter_env, policy, telling):
+    once = IntrinsicReward(telling())(rollout(counter_env(), policy()))
+    with pytest.raises(UserError, match=r"\('next', 'extrinsic_reward'\) already"):
+        IntrinsicReward(telling())(once)
+    again = IntrinsicReward(ConstantReward(), extrinsic_key=None)(once)
+    assert again["next", "reward"].eq(1).all()
+    assert torch.equal(again["next", "extrinsic_reward"], once["next", "extrinsic_reward"])
+    env = TransformedEnv(counter_env(), IntrinsicReward(telling()))
+    start = env.rand_step(env.reset())
+    env.step(start)  # What a step left there is replaced by the next one.
+    with pytest.raises(UserError, match="'extrinsic_reward' already"):
+        TransformedEnv(env, IntrinsicReward(telling())).rollout(1)
+    with pytest.raises(UserError, match="'observation' already"):
+        TransformedEnv(
+            counter_env(), IntrinsicReward(telling(), extrinsic_key="observation")
+        ).rollout(1)
+
+
+def test_the_padding_of_split_trajectories_is_not_paid(counter_env, policy, telling):
+    kinds = {"auto_register_policy_transforms": False, "split_trajs": True}
+    collector = Collector(
+        counter_env(),
+        policy(),
+        frames_per_batch=24,
+        total_frames=24,
+        postproc=IntrinsicReward(telling()),
+        **kinds,
+    )
+    (data,) = collector
+    collector.shutdown()
+    real = data["collector", "mask"]
+    assert not real.all()
+    assert torch.equal(data[real]["next", "reward"], expected_reward(data[real]))
+    assert data["next", "reward"][~real].eq(0).all()
+    played = rollout(counter_env(2), policy())
+    split = split_trajectories(played, done_key="done")
+    paid = IntrinsicReward(ConstantReward())(split)
+    assert paid["next", "reward"].sum() == played.numel() < split.numel()
+
+
 def test_bad_inputs(counter_env, policy):
     with pytest.raises(UserError, match="TensorDictModule"):
         IntrinsicReward(nn.Linear(2, 1))
@@ -230,8 +272,15 @@ def test_bad_inputs(counter_env, policy):
     two_values = TensorDictModule(lambda s: s, ["observation"], [("next", "intrinsic_reward")])
     with pytest.raises(UserError, match="one value per transition"):
         IntrinsicReward(two_values)(rollout(counter_env(), policy()))
+        IntrinsicReward(two_values, extrinsic_key=None)(
+            rollout(counter_env(), policy()).exclude(("next", "reward"))
+        )
     with pytest.raises(UserError, match="next"):
         IntrinsicReward(ConstantReward())(TensorDict(batch_size=[3]))
+    forgetful = ConstantReward()
+    forgetful.forward = lambda tensordict: tensordict
+    with pytest.raises(UserError, match="wrote no tensor"):
+        IntrinsicReward(forgetful)(rollout(counter_env(), policy()))
 
 
 def test_deepcopy(counter_env, policy, telling):

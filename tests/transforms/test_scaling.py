@@ -2,12 +2,13 @@ import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
+from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
-from torchrl.envs import Compose, SerialEnv, TransformedEnv
+from torchrl.envs import Compose, SerialEnv, Transform, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
 from giril_rl.errors import UserError
-from giril_rl.rewards import GenerativeReward
+from giril_rl.rewards import ConstantReward, GenerativeReward
 from giril_rl.transforms import BatchMeanReward, IntrinsicReward, ReturnScaling
 
 
@@ -230,6 +231,82 @@ def test_no_gradient_and_dtype():
 def test_bad_arguments(kwargs):
     with pytest.raises(UserError, match=next(iter(kwargs))):
         ReturnScaling(**kwargs)
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), 1e200])
+def test_a_reward_that_is_not_finite_is_refused_and_not_learned(value):
+    reward = torch.randn(3, 20, 1, dtype=torch.float64)
+    scaling, twin = ReturnScaling(), ReturnScaling()
+    for one in (scaling, twin):
+        one(make_batch(reward))
+    bad = reward.clone()
+    bad[1, 18] = bad[2, 17] = value
+    sentence = "too large" if value == 1e200 else f"is {value} in environment 2 at step 17 of"
+    with pytest.raises(UserError, match=sentence):
+        scaling(make_batch(bad))
+    for name, expected in twin.state_dict().items():
+        assert torch.equal(scaling.state_dict()[name], expected)
+    out = scaling(make_batch(reward))["next", "reward"]
+    assert torch.equal(out, twin(make_batch(reward))["next", "reward"])
+
+
+def test_the_place_of_a_reward_that_is_not_finite(counter_env):
+    agents = torch.zeros(4, 5, 2, 1)
+    agents[3, 2, 1] = float("nan")
+    with pytest.raises(UserError, match="in environment 3 at step 2 of"):
+        ReturnScaling()(make_batch(agents).auto_batch_size_(2))
+    agents[:, 2] = float("nan")
+    with pytest.raises(UserError, match="in every environment at step 2 of"):
+        ReturnScaling()(make_batch(agents).auto_batch_size_(2))
+    spoilt = counter_env(reward=lambda t: torch.tensor([[0.0], [torch.inf], [0.0]]))
+    with pytest.raises(UserError, match="is inf in environment 1 at this step"):
+        TransformedEnv(spoilt, ReturnScaling()).rollout(2)
+
+
+@pytest.mark.parametrize("make", [ReturnScaling, BatchMeanReward])
+def test_split_trajectories_are_refused(counter_env, make):
+    kinds = {"auto_register_policy_transforms": False, "split_trajs": True}
+    collector = Collector(
+        counter_env(), frames_per_batch=24, total_frames=24, postproc=make(), **kinds
+    )
+    with pytest.raises(UserError, match="split_trajs=False"):
+        next(iter(collector))
+    collector.shutdown()
+    split = make_batch(torch.ones(2, 3, 1))
+    split["collector", "mask"] = torch.tensor([[True] * 3, [True, False, False]])
+    scaling = ReturnScaling(clip=None)
+    scaling(make_batch(torch.randn(2, 5, 1)))
+    deviation = (scaling.m2 / scaling.count + 1e-8).sqrt().float()
+    scaled = scaling.freeze()(split)["next", "reward"]
+    torch.testing.assert_close(scaled, torch.ones(2, 3, 1) / deviation)
+
+
+class Odd(Transform):
+    """Stands for an environment that breaks its word."""
+
+    def __init__(self, reward):
+        super().__init__()
+        self.reward = reward
+
+    def _step(self, tensordict, next_tensordict):
+        if self.reward is None:
+            return next_tensordict.exclude("reward")
+        return next_tensordict.set("reward", self.reward)
+
+
+@pytest.mark.parametrize("make", [ReturnScaling, BatchMeanReward, IntrinsicReward])
+def test_a_reward_that_is_not_there_or_not_of_its_specs_shape(counter_env, make):
+    transform = make(ConstantReward()) if make is IntrinsicReward else make()
+    for missing in (TensorDict({"next": {}}, [2]), TensorDict({"next": {"reward": None}}, [2])):
+        with pytest.raises(UserError, match="no reward under"):
+            transform(missing)
+    for reward, sentence in (
+        (None, "no reward under"),
+        (torch.zeros(3, 3), r"\(3, 3\) where its spec says \(3, 1\)"),
+        (torch.zeros(3), r"\(3,\) where its spec says \(3, 1\)"),
+    ):
+        with pytest.raises(UserError, match=sentence):
+            TransformedEnv(counter_env(), Compose(Odd(reward), transform.clone())).rollout(1)
 
 
 def test_another_number_of_environments_is_refused():

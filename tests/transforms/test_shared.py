@@ -11,7 +11,13 @@ import torch
 from tensordict import LazyStackedTensorDict, TensorDict
 from tensordict.nn import TensorDictModule
 from torch import nn
-from torchrl.data import LazyTensorStorage, ReplayBuffer, TensorDictReplayBuffer
+from torchrl.data import (
+    LazyMemmapStorage,
+    LazyStackStorage,
+    LazyTensorStorage,
+    ReplayBuffer,
+    TensorDictReplayBuffer,
+)
 from torchrl.envs import Compose, GymEnv, ParallelEnv, SerialEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
@@ -115,7 +121,7 @@ def test_transform_no_env(make, shape, group):
     batch = transitions(*shape, group=group)
     given = batch.clone()
     out = make(group)(batch)
-    assert out is batch and out.shape == shape
+    assert (batch == given).all() and out.shape == shape
     assert reward_of(out, group).shape == (*shape, 1) and reward_of(out, group).isfinite().all()
     kept = given.exclude(("next", *reward_path(group)))
     assert all(torch.equal(out[key], kept[key]) for key in kept.keys(True, True))
@@ -128,17 +134,22 @@ def reward_path(group):
     return ("reward",) if group is None else (group, "reward")
 
 
-def test_lazy_stacks_are_changed_in_place(make):
+def test_lazy_stacks(make):
     batch = transitions(4, 6)
     lazy = LazyStackedTensorDict.lazy_stack(batch.clone().unbind(0))
-    make()(lazy)
-    assert torch.equal(lazy["next", "reward"], make()(batch)["next", "reward"])
+    out = make()(lazy)
+    assert torch.equal(out["next", "reward"], make()(batch)["next", "reward"])
+    assert (lazy == batch).all()
 
 
 def test_transform_compose(make):
     batch = transitions(4, 6)
     alone = make()(batch.clone())["next", "reward"]
     assert torch.equal(Compose(make())(batch.clone())["next", "reward"], alone)
+    if make is intrinsic:  # Both would keep a true reward in one place.
+        with pytest.raises(UserError, match=r"\('next', 'true'\) already"):
+            Compose(intrinsic(), make())(batch)
+        return
     both = Compose(intrinsic(), make())(batch.clone())
     assert torch.equal(both["next", "reward"], make()(intrinsic()(batch))["next", "reward"])
 
@@ -184,6 +195,21 @@ def test_transform_rb(make, rbclass):
     else:
         factor = 0.5 if make is weighted else 1.0
         assert torch.equal(sample["next", "reward"], factor * sample["other"])
+
+
+@pytest.mark.parametrize("storage", [LazyTensorStorage, LazyMemmapStorage, LazyStackStorage])
+def test_a_buffer_keeps_what_it_stores(make, storage):
+    buffer = TensorDictReplayBuffer(storage=storage(5), transform=make(), batch_size=5)
+    given = transitions(5)
+    if make is scaling:
+        buffer.transform.train()(given)
+        buffer.transform.eval()
+    buffer.extend(given)
+    once = buffer[:]["next", "reward"].clone()
+    buffer.sample()
+    assert torch.equal(buffer[:]["next", "reward"], once)
+    assert (buffer.storage[:].select(*given.keys(True, True)) == given).all()
+    assert "true" not in buffer.storage[:]["next"].keys()
 
 
 def test_transform_inverse(make):

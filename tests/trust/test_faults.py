@@ -22,6 +22,7 @@ from giril_rl.errors import FAILED, RunError
 from giril_rl.rewards import GenerativeReward, GenerativeRewardLoss
 from giril_rl.training import Run, clone_behaviour, fit_reward, make_agent, train_ppo
 from giril_rl.training.checkpoint import load_state
+from giril_rl.transforms import ReturnScaling
 
 TASK = TaskConfig(name="cartpole", env_id="CartPole-v1")
 SMALL = PPOConfig(num_envs=2, rollout=32, minibatch=64, epochs=1, hidden=[8], checkpoint_every=64)
@@ -102,19 +103,23 @@ class Breaks(nn.Module):
         return batch.set(("next", "reward"), reward)
 
 
+@pytest.mark.parametrize("scaled", [False, True])
 @pytest.mark.parametrize("value", [float("nan"), float("inf")])
-def test_a_reward_that_is_no_number(value, tmp_path):
-    sentence = (
-        rf"next reward is {value} at \[0, 5, 0\] of the batch, so that loss_\w+ is \w+ at 192"
-    )
-    with pytest.raises(RunError, match=sentence):
-        trained(tmp_path, Breaks(value))
+def test_a_reward_that_is_no_number(value, scaled, tmp_path):
+    def relabel(value):
+        return nn.Sequential(Breaks(value), *[ReturnScaling()] * scaled)
+
+    what = rf"next reward is {value} at \[0, 5, 0\] of the batch, so that loss_\w+ is \w+"
+    if scaled:
+        what = f"the reward is {value} in environment 0 at step 5 of the batch"
+    with pytest.raises(RunError, match=f"{what} at 192 of 256 steps: see where that comes from"):
+        trained(tmp_path, relabel(value))
     saved = load_state(tmp_path / "ppo.safetensors")
     assert saved["steps"] == 128
     weights = [v for v in saved["parts"].values() if v.is_floating_point()]
     assert weights and all(v.isfinite().all() for v in weights)
     # The same folder goes on from there once its reward is sound.
-    trained(tmp_path, Breaks(1.0))
+    trained(tmp_path, relabel(1.0))
     assert load_state(tmp_path / "ppo.safetensors")["steps"] == 256
 
 

@@ -97,13 +97,16 @@ def group(content, folder="task"):
     return recipe(SETTINGS.replace("inverted_pendulum", "mine"))
 
 
+RUNS = "groups:\n- label: a\n  recipe: giril\n  "
+
+
 def study(content):
     return ["study", written("mine.yaml", content), "--dry-run"]
 
 
-def of(env_id):
+def of(env_id, **others):
     """A run that says that its environment is another one."""
-    settings = {"task": {"name": "a", "env_id": env_id}, "eval": {}}
+    settings = {"task": {"name": "a", "env_id": env_id}, "eval": {}, **others}
     return ["eval", run_folder(text("config.yaml", json.dumps(settings)))]
 
 
@@ -168,7 +171,27 @@ CASES = {
     "tag: a recipe's settings": (lambda: recipe(SETTINGS + f"seed: {CALL}\n"), "is not valid YAML"),
     "tag: a task": (lambda: group(f"name: {CALL}\n"), "is not valid YAML, line 1"),
     "bomb: a task": (lambda: group(BOMB), "task/mine.yaml cannot be read: its aliases stand"),
-    "module: a run's environment": (lambda: of("evil_module:Env-v0"), "is not a Gymnasium id"),
+    "module: a run's environment": (
+        lambda: of("evil_module:Env-v0"),
+        "names the module evil_module, and reading a run imports nothing",
+    ),
+    "module: one that a run imports": (
+        lambda: of("Env-v0", imports=["evil_module"]),
+        "names the module evil_module, and reading a run imports nothing",
+    ),
+    "module: a game's": (lambda: of("evil_module:ALE/Pong-v5"), "names the module evil_module"),
+    "module: imports that are none": (
+        lambda: of("Env-v0", imports={"evil_module": [3]}),
+        "is not a Gymnasium id",
+    ),
+    "module: a study's environment": (
+        lambda: study(RUNS + "task.env_id: evil_module:Env-v0"),
+        "a study's file alone imports nothing",
+    ),
+    "module: a study's imports": (
+        lambda: study(RUNS + "imports: [evil_module]"),
+        "a study's file alone imports nothing",
+    ),
     "module: a demonstration's": (
         lambda: [
             "demo",

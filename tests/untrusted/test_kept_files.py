@@ -7,6 +7,7 @@ import pytest
 import torch
 from files import DATA, kept, run_folder, words
 from tensordict import TensorDict
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from giril_rl.cli import main
 from giril_rl.demos import Demonstration
@@ -42,6 +43,15 @@ def test_reward_and_policy_are_read_and_do_what_they_did():
     card = read_json(DATA / "run/policy/card.json")
     assert (card["method"], card["task"], card["env_steps"]) == ("giril", "CartPole-v1", 256)
     assert policy.critic(torch.zeros(1, 4)).isfinite().all()
+
+
+def test_a_policy_of_scaled_actions_does_what_it_did():
+    policy = load_agent_from(DATA / "scaled_policy")
+    assert read_json(DATA / "scaled_policy/card.json")["format_version"] == 2
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        acted = policy.acting()(TensorDict({"observation": torch.tensor([1.0, -1.0])}, []))
+    assert acted["action"].tolist() == [1750.0, -0.5]
+    assert acted["drawn_action"].tolist() == [0.5, -4.0]
 
 
 def test_those_of_pixels_do_what_they_did(tmp_path):
@@ -92,7 +102,8 @@ def test_the_numbers_written_are_those_that_are_promised():
     page = (DATA.parents[1] / "docs/stability.md").read_text()
     assert read_json(DATA / "run/versions.json")["format_version"] == 1
     assert "| run folder | 1 |" in page and "| demonstration | 1 of vectors, 2 of images |" in page
-    for name, number in {"demonstration": 1, "demonstration_of_images": 2, "run/policy": 1}.items():
+    numbers = {"run/policy": 1, "scaled_policy": 2}
+    for name, number in {"demonstration": 1, "demonstration_of_images": 2, **numbers}.items():
         assert read_json(DATA / name / "card.json")["format_version"] == number
 
 

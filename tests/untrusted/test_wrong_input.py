@@ -174,6 +174,10 @@ RUN = {
     "value: last job of a sweep": (giril("-m", "reward.beta=1,2"), "must be in (0, 1]"),
     "value: not a choice": (giril("reward.prior=flat"), "choose one of standard, conditional"),
     "value: seed": (giril("seed=-1"), "seed=-1 must be at least 0."),
+    "value: a large seed": (giril(f"seed={10**22}"), f"seed={10**22}: at most {2**63 - 1} is"),
+    "value: a large seed of a part": (giril(f"demo.seed={2**64}"), "demo.seed=1844674407370955161"),
+    "value: thousands of digits": (giril("seed=" + "9" * 5_000), "the value cannot be read"),
+    "value: a number too large": (giril("ppo.lr=" + "9" * 400), "a number is needed"),
     "value: NaN": (giril("ppo.lr=nan"), "a finite number is needed"),
     "value: infinity": (giril("ppo.clip=inf"), "a finite number is needed"),
     **{
@@ -181,9 +185,7 @@ RUN = {
         for beta, shown in {"0": "0.0", "1.01": "1.01", "-1": "-1.0", "1e9": "1000000000.0"}.items()
     },
     "beta: NaN": (giril("reward.beta=nan"), "reward.beta=nan: a finite number"),
-    "steps: not whole batches": (giril("steps=2001"), "give 2000 or 4000."),
     "steps: none": (giril("steps=0"), "steps=0 must be at least 1."),
-    "steps: the expert's": (giril("expert.steps=1999"), "expert.steps=1999 is no whole number"),
     "steps: minibatch": (giril("ppo.minibatch=300"), "does not divide ppo.num_envs * ppo.rollout"),
     "steps: cloning": (lambda: ["run", "bc", "steps=10"], "cloning takes no environment steps"),
     "demo: both lengths": (giril("demo.episodes=1"), "give exactly one of them"),
