@@ -176,7 +176,9 @@ def test_expert_and_demonstration_are_made_once(root, tmp_path):
     before = stamps(root)
     assert len(list(root.glob("expert/CartPole-v1/*/result.json"))) == 1
     assert len(list(root.glob("demos/CartPole-v1/*/card.json"))) == 1
-    run("giril", tmp_path / "b", root, "seed=1", "ppo.lr=0.001", "demo.subsample=5")
+    run("giril", tmp_path / "b", root, "reward.seed=1", "ppo.lr=0.001", "demo.subsample=5")
+    seeds = ("expert.seed=0", "demo.seed=0")
+    run("giril", tmp_path / "d", root, "seed=1", *seeds)
     assert stamps(root) == before
     # A demonstration with other settings is another one, of the same expert.
     run("giril", tmp_path / "c", root, "demo.length=60")
