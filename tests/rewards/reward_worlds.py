@@ -71,7 +71,7 @@ class Breakout(Counter):
 
     def __init__(self) -> None:
         pytest.importorskip("ale_py")
-        env = AtariEnv("breakout", 2)
+        env = AtariEnv("breakout", 2, seed=2)
         policy = TensorDictModule(self.act, ["observation"], ["action"])
         self.earlier = env.rollout(self.before, policy)
         self.state = env.simulator_state()
@@ -81,7 +81,7 @@ class Breakout(Counter):
 
     def env(self) -> EnvBase:
         """Both games as they stand after the earlier steps."""
-        env = AtariEnv("breakout", 2)
+        env = AtariEnv("breakout", 2, seed=2)
         env.restore_simulator(self.state)
         return env
 
@@ -93,7 +93,7 @@ class Breakout(Counter):
     def true_next(self) -> torch.Tensor:
         """In the first life, the stacks of a plain game that is played the same actions."""
         following = self.played["next", "observation"].clone()
-        fresh = AtariEnv("breakout", 2)
+        fresh = AtariEnv("breakout", 2, seed=2)
         actions = torch.cat([self.earlier["action"], self.played["action"]], 1)
         for i, ends in enumerate(self.ends):
             game = AtariGame("breakout")

@@ -64,10 +64,11 @@ def spoilt_demonstration(change):
 def run_folder(change=lambda folder: None, finished=True):
     """The kept run as if made here, changed."""
     from giril_rl.files import installed_versions, write_json
+    from giril_rl.formats import RUN_FORMAT
 
     def ready(folder):
         (folder / ".lock").touch()
-        write_json(folder / "versions.json", {"format_version": 1, **installed_versions()})
+        write_json(folder / "versions.json", {"format_version": RUN_FORMAT, **installed_versions()})
         if not finished:
             (folder / "result.json").unlink()
         change(folder)

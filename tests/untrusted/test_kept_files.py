@@ -100,6 +100,7 @@ def test_a_run_from_before_formats_were_numbered_is_read(here):
 
 
 def test_a_run_of_format_1_is_read_and_not_taken_for_todays(here, capsys):
+    kept("demonstration")
     kept("run_of_format_1")
     assert main(["report", ".", "--out", "report"]) == 0
     assert "1 finished runs" in capsys.readouterr().out
