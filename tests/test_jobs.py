@@ -21,7 +21,7 @@ def folder(*texts, recipe="giril"):
     [
         (["profile=released"], "default"),
         (["task=inverted_pendulum", "ppo.lr=3e-4", "fit.steps=50000"], "default"),
-        (["task.steps=300000", "steps=300000", "demo.path=null"], "default"),
+        (["task.steps=300000", "steps=300000", "demo.path=shipped"], "default"),
         (
             ["eval.episodes=3", "ppo.checkpoint_every=7", "fit.log_every=9", "imports=[a]"],
             "default",

