@@ -279,8 +279,12 @@ class Run:
         """An unfinished run goes on with the settings of now, where they may differ."""
         path = self.folder / "config.yaml"
         config = self._written_config()
-        if not path.exists() or not (self.finished or parse_yaml(read_text(path)) == config):
-            write_atomically(path, yaml.safe_dump(config, sort_keys=False))
+        if path.exists():
+            before = flat(parse_yaml(read_text(path)), keep_empty=True)
+            now = flat(config, keep_empty=True)
+            if self.finished or all(before.get(key, now[key]) == now[key] for key in now):
+                return
+        write_atomically(path, yaml.safe_dump(config, sort_keys=False))
 
     def _check_checkpoints(self) -> None:
         """A damaged one is refused now, not when its part's turn has come."""
