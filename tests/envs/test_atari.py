@@ -148,7 +148,7 @@ def test_after_a_lost_life_the_game_goes_on_and_after_a_game_another_begins():
 def test_whole_game_scores_are_those_of_a_plain_loop(name):
     """The same game step by step by hand: all lives, unclipped."""
     task = TaskConfig(name=name, env_id=f"ALE/{IDS[name]}-v5")
-    env = make_env(for_scores(task), 1, seed=4)
+    env = make_env(for_scores(task), 1, seed=5)
     generator = torch.Generator().manual_seed(0)
     actions, score, root = [], 0.0, env.reset()
     while True:
@@ -162,7 +162,7 @@ def test_whole_game_scores_are_those_of_a_plain_loop(name):
     assert after["next", "game_over"].item()
 
     game = AtariGame(name)
-    _, lives = game.reset(stream_seed("training", 4, 0, 0, bits=32))
+    _, lives = game.reset(stream_seed("training", 5, 0, 0, bits=32))
     plain = 0.0
     opening = [1, 2] if game.fires else []
     for action in opening:

@@ -302,8 +302,8 @@ PLACES = {
         "config.yaml cannot be read",
     ),
     "run: of a later format": (
-        lambda: resumed(entries("versions.json", format_version=2)),
-        "run has run format 2, written by a later giril_rl",
+        lambda: resumed(entries("versions.json", format_version=3)),
+        "run has run format 3, written by a later giril_rl",
     ),
     "checkpoint: cut short": (lambda: resumed(cut("ppo.safetensors")), "is damaged or not a giril"),
     "checkpoint: of the part before": (lambda: resumed(cut("fit.safetensors")), "is damaged"),
@@ -390,7 +390,7 @@ LEFT_BEHIND = {
     "eval: no deviation": (evaluated(entries("result.json", drop=["return_std"])), "no return_std"),
     "report: result of nothing": (reported(text("result.json", "{}")), "has no method"),
     "report: of a later format": (
-        reported(entries("versions.json", format_version=2)),
+        reported(entries("versions.json", format_version=3)),
         "upgrade giril_rl",
     ),
     "report: into a file": (
