@@ -14,6 +14,7 @@ from pixels import Pixels, steer
 
 from giril_rl.cli import main
 from giril_rl.demos import record_demonstration
+from giril_rl.files import processor
 
 
 @pytest.fixture
@@ -67,6 +68,7 @@ def test_images_are_described(images, capsys):
         f"actions      {', '.join(parts)}",
         "played       deterministic, seed 0",
         "expert       return 1,234.5, seed 2",
+        f"processor    {processor()}",
         "",
         "episode  length  score  end",
         f"      0       3    {scores[0]}  life lost",
@@ -82,6 +84,7 @@ def test_vectors_are_described(vectors, capsys):
         "actions      1 number from 0.00 to 1.00",
         "played       sampled, seed 3",
         "expert       not known",
+        f"processor    {processor()}",
         "",
         "episode  length  score  end",
         "      0       5    5.0  terminated",

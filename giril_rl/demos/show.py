@@ -21,6 +21,7 @@ def describe(demo: Demonstration) -> str:
         ...     lambda: gymnasium.make("CartPole-v1"), lambda o: o.new_ones(1).long(),
         ...     length=15, seed=0, task="cartpole", expert={"return_mean": 9.5, "seed": 1},
         ... )
+        >>> demo.card["processor"] = "of this example"
         >>> print(describe(demo))
         task         cartpole (CartPole-v1)
         id           ...
@@ -30,6 +31,7 @@ def describe(demo: Demonstration) -> str:
         actions      1: 15 (100%)
         played       deterministic, seed 0
         expert       return 9.5, seed 1
+        processor    of this example
         <BLANKLINE>
         episode  length  score  end
               0      10   10.0  terminated
@@ -50,6 +52,8 @@ def describe(demo: Demonstration) -> str:
         "played": f"{played}, seed {card.get('seed')}",
         "expert": _expert(card.get("expert")),
     }
+    if isinstance(card.get("processor"), str):
+        rows["processor"] = card["processor"]
     source = card.get("source")
     if isinstance(source, dict):
         rows["source"] = f"{source.get('name')} ({source.get('format')})"
@@ -78,7 +82,9 @@ def _actions(demo: Demonstration) -> str:
 def _expert(expert: object) -> str:
     if not isinstance(expert, dict) or not isinstance(expert.get("return_mean"), int | float):
         return "not known"
-    return f"return {expert['return_mean']:,.1f}, seed {expert.get('seed')}"
+    steps = expert.get("env_steps")
+    trained = f", {steps:,} steps" if isinstance(steps, int) else ""
+    return f"return {expert['return_mean']:,.1f}, seed {expert.get('seed')}{trained}"
 
 
 def _episodes(demo: Demonstration) -> list[str]:
