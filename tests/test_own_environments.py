@@ -50,6 +50,7 @@ def own(tmp_path, monkeypatch):
         gymnasium.registry.pop("Own-v0", None)
 
     monkeypatch.chdir(tmp_path)
+    monkeypatch.delitem(gymnasium.registry, "BallOnBeam-v0", raising=False)  # The tutorials'.
     monkeypatch.setattr(sys, "path", [entry for entry in sys.path if entry])
     Path("own_envs.py").write_text(MODULE)
     yield forget

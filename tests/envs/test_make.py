@@ -15,7 +15,8 @@ def refused(env_id, **kwargs):
     return message
 
 
-def test_unknown_id_names_the_nearest():
+def test_unknown_id_names_the_nearest(monkeypatch):
+    monkeypatch.delitem(gymnasium.registry, "BallOnBeam-v0", raising=False)  # The tutorials'.
     assert "CartPol-v1 is not a Gymnasium id; did you mean 'CartPole" in refused("CartPol-v1")
     assert "InvertedPendulumBulletEnv-v0" in refused("InvertedPendulmBulletEnv-v0")
     assert refused("zzz") == (
