@@ -50,7 +50,6 @@ def own(tmp_path, monkeypatch):
         gymnasium.registry.pop("Own-v0", None)
 
     monkeypatch.chdir(tmp_path)
-    monkeypatch.delitem(gymnasium.registry, "BallOnBeam-v0", raising=False)  # The tutorials'.
     monkeypatch.setattr(sys, "path", [entry for entry in sys.path if entry])
     Path("own_envs.py").write_text(MODULE)
     yield forget
@@ -117,7 +116,8 @@ def test_its_demonstrations_are_imported(own, words):
         ("", "task.env_id=own_envs:Own-v0 is not a Gymnasium id that own_envs registers: check it"),
     ],
 )
-def test_a_module_that_cannot_be_used_is_named(own, text, sentence, tmp_path, capsys):
+def test_a_module_that_cannot_be_used_is_named(own, text, sentence, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("gymnasium.registry", {})  # Other tests may have added what is near.
     Path("own_envs.py").unlink()
     shutil.rmtree("__pycache__", ignore_errors=True)
     if text is not None:
