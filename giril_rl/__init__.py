@@ -8,6 +8,8 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from giril_rl import moved
+
 if TYPE_CHECKING:
     from giril_rl.transforms import (
         BatchMeanReward,
@@ -17,6 +19,8 @@ if TYPE_CHECKING:
         WeightedReward,
         check_reward,
     )
+
+moved.install()
 
 __all__ = [
     "BatchMeanReward",

@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
-from giril_rl.configs import BCConfig, DemoConfig, ExpertConfig, UnaveragedRunConfig, knob
+from giril_rl.config.schema import BCConfig, DemoConfig, ExpertConfig, UnaveragedRunConfig, knob
 from giril_rl.demos import holdout, subsample
 from giril_rl.envs import make_env
 from giril_rl.training import (

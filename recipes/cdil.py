@@ -11,7 +11,7 @@ from typing import cast
 
 from torchrl.envs import Compose
 
-from giril_rl.configs import (
+from giril_rl.config.schema import (
     CuriosityConfig,
     DemoConfig,
     ExpertConfig,
@@ -21,11 +21,11 @@ from giril_rl.configs import (
 )
 from giril_rl.demos import holdout, subsample
 from giril_rl.envs import make_env
+from giril_rl.methods import curiosity_reward
 from giril_rl.rewards import CuriosityRewardLoss, FeatureTraining
 from giril_rl.training import (
     Run,
     check_inputs,
-    curiosity_reward,
     finish_run,
     fit_reward,
     make_agent,

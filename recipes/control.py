@@ -10,8 +10,9 @@ from pathlib import Path
 
 from torchrl.envs import Compose
 
-from giril_rl.configs import ControlRunConfig
+from giril_rl.config.schema import ControlRunConfig
 from giril_rl.envs import make_env
+from giril_rl.methods import control_reward
 from giril_rl.training import (
     HeldAction,
     RandomPolicy,
@@ -20,7 +21,6 @@ from giril_rl.training import (
     check_discrete,
     check_inputs,
     check_task,
-    control_reward,
     finish_run,
     held_action_scores,
     make_agent,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from giril_rl.configs import ExpertRunConfig
+from giril_rl.config.schema import ExpertRunConfig
 from giril_rl.training import train_expert
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from torchrl.envs import Compose
 
-from giril_rl.configs import (
+from giril_rl.config.schema import (
     AdversarialConfig,
     DemoConfig,
     ExpertConfig,
@@ -19,12 +19,12 @@ from giril_rl.configs import (
 )
 from giril_rl.demos import subsample
 from giril_rl.envs import make_env
+from giril_rl.methods import discriminator_reward
 from giril_rl.rewards import DiscriminatorLoss
 from giril_rl.training import (
     AdversarialLearner,
     Run,
     check_inputs,
-    discriminator_reward,
     finish_run,
     make_agent,
     obtain_demonstration,

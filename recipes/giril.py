@@ -10,7 +10,7 @@ from pathlib import Path
 
 from torchrl.envs import Compose
 
-from giril_rl.configs import (
+from giril_rl.config.schema import (
     DemoConfig,
     ExpertConfig,
     FitConfig,
@@ -20,13 +20,13 @@ from giril_rl.configs import (
 )
 from giril_rl.demos import holdout, subsample
 from giril_rl.envs import make_env
+from giril_rl.methods import generative_reward
 from giril_rl.rewards import GenerativeRewardLoss
 from giril_rl.training import (
     Run,
     check_inputs,
     finish_run,
     fit_reward,
-    generative_reward,
     make_agent,
     obtain_demonstration,
     return_scaling,

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from torchrl.envs import Compose
 
-from giril_rl.configs import (
+from giril_rl.config.schema import (
     BottleneckConfig,
     DemoConfig,
     ExpertConfig,
@@ -19,11 +19,11 @@ from giril_rl.configs import (
 )
 from giril_rl.demos import subsample
 from giril_rl.envs import make_env
+from giril_rl.methods import bottleneck_reward
 from giril_rl.rewards import BottleneckLoss
 from giril_rl.training import (
     AdversarialLearner,
     Run,
-    bottleneck_reward,
     check_inputs,
     finish_run,
     make_agent,

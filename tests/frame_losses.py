@@ -6,8 +6,9 @@ import torch
 from tensordict import TensorDict
 from torchrl.data import Categorical
 
-from giril_rl.configs import PPOConfig
-from giril_rl.networks.pixel_policy import PixelActorCritic
+from giril_rl.config.schema import PPOConfig
+from giril_rl.graphs.traced import TracedGradients
+from giril_rl.policies.pixel_policy import PixelActorCritic
 from giril_rl.rewards import (
     BottleneckLoss,
     BottleneckReward,
@@ -19,7 +20,6 @@ from giril_rl.rewards import (
     GenerativeRewardLoss,
 )
 from giril_rl.training.ppo import PPOLearner
-from giril_rl.training.traced import TracedGradients
 
 
 def frames(rows):

@@ -5,13 +5,13 @@ import math
 
 import pytest
 
-from giril_rl.cli import main
-from giril_rl.compose import resolved
+from giril_rl.cli.command_line import main
+from giril_rl.config.compose import resolved
+from giril_rl.config.recipe_config import config_class
+from giril_rl.config.recipe_files import find
 from giril_rl.errors import UserError
-from giril_rl.recipe_config import config_class
-from giril_rl.recipes import find
-from giril_rl.training.checkpoint import load_state
-from giril_rl.training.metrics import read_metrics
+from giril_rl.files.checkpoint import load_state
+from giril_rl.runs.metrics import read_metrics
 
 TINY = [
     "ppo.hidden=[16,16]",

@@ -5,10 +5,10 @@ from pathlib import Path
 
 import pytest
 
-from giril_rl import recipes
-from giril_rl.cli import main
-from giril_rl.recipe_config import config_class
-from giril_rl.schema import leaves
+from giril_rl.cli.command_line import main
+from giril_rl.config import recipe_files as recipes
+from giril_rl.config.leaves import leaves
+from giril_rl.config.recipe_config import config_class
 
 FAKE = '''"""Fake: writes what it was given.
 
@@ -18,7 +18,7 @@ import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from giril_rl.configs import RunConfig, knob
+from giril_rl.config.schema import RunConfig, knob
 from giril_rl.errors import UserError
 
 
@@ -92,13 +92,14 @@ def test_ls_names_every_recipe_with_its_first_line(capsys):
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )
 def test_nothing_heavy_is_imported_before_a_run(argv, absent):
-    code = f"import sys, giril_rl.cli as c; c.main({argv!r}); print(*sys.modules, file=sys.stderr)"
+    code = f"import sys, giril_rl.cli.command_line as c; c.main({argv!r})"
+    code += "; print(*sys.modules, file=sys.stderr)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert not absent & set(done.stderr.split())
 
 
 def test_module_runs_as_a_script_and_returns_its_exit_code():
-    command = [sys.executable, "-m", "giril_rl.cli", "run", "girl"]
+    command = [sys.executable, "-m", "giril_rl", "run", "girl"]
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 2
     assert done.stderr == "giril: 'girl' is not a recipe; did you mean 'giril'?\n"
@@ -332,9 +333,9 @@ def test_eval_hands_its_arguments_on(tmp_path, monkeypatch):
     import types
 
     calls = []
-    module = types.ModuleType("giril_rl.training.finished")
+    module = types.ModuleType("giril_rl.training.rescore")
     module.evaluate_run = lambda *arguments: calls.append(arguments)
-    monkeypatch.setitem(sys.modules, "giril_rl.training.finished", module)
+    monkeypatch.setitem(sys.modules, "giril_rl.training.rescore", module)
     assert main(["eval", str(tmp_path), "--episodes", "3"]) == 0
     assert main(["eval", str(tmp_path), "--seed", "0"]) == 0
     assert calls == [(tmp_path, 3, None), (tmp_path, None, 0)]

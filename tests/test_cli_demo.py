@@ -12,9 +12,9 @@ sys.path.insert(0, str(Path(__file__).parent / "demos"))
 from counter import Counter
 from pixels import Pixels, steer
 
-from giril_rl.cli import main
+from giril_rl.cli.command_line import main
 from giril_rl.demos import record_demonstration
-from giril_rl.files import processor
+from giril_rl.files.disk import processor
 
 
 @pytest.fixture

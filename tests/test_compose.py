@@ -2,13 +2,13 @@ from dataclasses import fields, is_dataclass, replace
 
 import pytest
 
-from giril_rl.compose import groups, resolved
-from giril_rl.configs import RunConfig, TaskConfig
+from giril_rl.config.compose import groups, resolved
+from giril_rl.config.overrides import sweep
+from giril_rl.config.recipe_config import config_class
+from giril_rl.config.recipe_files import copy, find, shipped
+from giril_rl.config.schema import RunConfig, TaskConfig
 from giril_rl.errors import UserError
-from giril_rl.naming import config_hash, out_folder, safe, variant
-from giril_rl.overrides import sweep
-from giril_rl.recipe_config import config_class
-from giril_rl.recipes import copy, find, shipped
+from giril_rl.runs.naming import config_hash, out_folder, safe, variant
 
 GIRIL = find("giril")
 CONFIG = config_class(GIRIL)

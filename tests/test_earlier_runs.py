@@ -7,16 +7,16 @@ from pathlib import Path
 import pytest
 import yaml
 
-from giril_rl.cli import main
-from giril_rl.study.plan import Planner
-from giril_rl.study.spec import read_spec
+from giril_rl.cli.command_line import main
+from giril_rl.experiments.study.plan import Planner
+from giril_rl.experiments.study.spec import read_spec
 
 RECIPE = '''"""Fake: a run without work."""
 
 from dataclasses import asdict, dataclass
 
-from giril_rl.configs import RunConfig, knob
-from giril_rl.naming import config_hash
+from giril_rl.config.schema import RunConfig, knob
+from giril_rl.runs.naming import config_hash
 from giril_rl.training import Run
 
 SCORES = ("return_mean", "return_std", "return_median", "episode_length_mean")

@@ -3,7 +3,7 @@ import os
 import pytest
 
 from giril_rl.errors import UserError
-from giril_rl.files import csv_text, read_json, write_atomically, write_json
+from giril_rl.files.disk import csv_text, read_json, write_atomically, write_json
 
 
 def test_failed_write_keeps_the_old_file_and_leaves_nothing_else(tmp_path, monkeypatch):

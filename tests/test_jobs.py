@@ -2,10 +2,10 @@
 
 import pytest
 
-from giril_rl.jobs import Jobs
-from giril_rl.naming import out_folder
-from giril_rl.recipe_config import config_class
-from giril_rl.recipes import copy, find
+from giril_rl.config.jobs import Jobs
+from giril_rl.config.recipe_config import config_class
+from giril_rl.config.recipe_files import copy, find
+from giril_rl.runs.naming import out_folder
 
 JOBS = Jobs()
 

@@ -2,7 +2,8 @@ from dataclasses import asdict, dataclass, field, replace
 
 import pytest
 
-from giril_rl.configs import (
+from giril_rl.config.leaves import leaves
+from giril_rl.config.schema import (
     BottleneckConfig,
     ControlRunConfig,
     EvalConfig,
@@ -13,8 +14,7 @@ from giril_rl.configs import (
     RunConfig,
     TaskConfig,
 )
-from giril_rl.naming import ADDED, NO_EFFECT, config_hash, variant, without_added
-from giril_rl.schema import leaves
+from giril_rl.runs.naming import ADDED, NO_EFFECT, config_hash, variant, without_added
 
 TASK = TaskConfig("pole", "Pole-v0", None, 300_000, 990.0)
 

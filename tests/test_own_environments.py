@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from giril_rl.cli import main
-from giril_rl.compose import resolved
-from giril_rl.imports import import_modules
-from giril_rl.recipe_config import config_class
-from giril_rl.study.plan import Planner
-from giril_rl.study.spec import read_spec
+from giril_rl.cli.command_line import main
+from giril_rl.config.compose import resolved
+from giril_rl.config.imports import import_modules
+from giril_rl.config.recipe_config import config_class
+from giril_rl.experiments.study.plan import Planner
+from giril_rl.experiments.study.spec import read_spec
 
 MODULE = """
 import gymnasium

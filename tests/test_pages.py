@@ -24,11 +24,11 @@ import pages
 import pytest
 import yaml
 
-from giril_rl.cli import main
-from giril_rl.cli_parser import Parser
-from giril_rl.recipe_config import config_class
-from giril_rl.recipes import Recipe
-from giril_rl.study.spec import Spec, read_spec
+from giril_rl.cli.command_line import main
+from giril_rl.cli.parser import Parser
+from giril_rl.config.recipe_config import config_class
+from giril_rl.config.recipe_files import Recipe
+from giril_rl.experiments.study.spec import Spec, read_spec
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -124,9 +124,9 @@ def dry(monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [*sys.path])
     monkeypatch.setattr(Recipe, "load", load)
-    monkeypatch.setattr("giril_rl.study.command.read_spec", first_of_each)
-    monkeypatch.setattr("giril_rl.training.finished.evaluate_run", lambda *words: None)
-    monkeypatch.setattr("giril_rl.report.report.write_report", lambda runs, out: out)
+    monkeypatch.setattr("giril_rl.cli.study.read_spec", first_of_each)
+    monkeypatch.setattr("giril_rl.training.rescore.evaluate_run", lambda *words: None)
+    monkeypatch.setattr("giril_rl.experiments.report.report.write_report", lambda runs, out: out)
     return done
 
 

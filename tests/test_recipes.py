@@ -15,10 +15,10 @@ import pytest
 import torch
 from gymnasium.envs.classic_control.cartpole import CartPoleEnv
 
-from giril_rl.cli import main
+from giril_rl.cli.command_line import main
 from giril_rl.envs import GymVectorEnv
-from giril_rl.training.checkpoint import load_state
-from giril_rl.training.metrics import read_metrics
+from giril_rl.files.checkpoint import load_state
+from giril_rl.runs.metrics import read_metrics
 
 BATCH = 128
 TINY = [
@@ -220,7 +220,7 @@ LONG = 60 * BATCH
 def start_and_stop(command, folder, number):
     """Starts ``giril`` and signals it once five batches are on record; its code and its words."""
     process = subprocess.Popen(
-        [sys.executable, "-m", "giril_rl.cli", *command],
+        [sys.executable, "-m", "giril_rl", *command],
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,
         text=True,

@@ -1,12 +1,18 @@
 import pytest
 import yaml
 
-from giril_rl.compose import resolved
-from giril_rl.configs import ControlRunConfig, ExpertRunConfig, PPOConfig, RunConfig, TaskConfig
-from giril_rl.recipe_config import config_class
-from giril_rl.recipes import find, shipped, shipped_conf
-from giril_rl.schema import flat, leaves
-from giril_rl.task_defaults import apply_task_defaults, task_defaults
+from giril_rl.config.compose import resolved
+from giril_rl.config.leaves import flat, leaves
+from giril_rl.config.recipe_config import config_class
+from giril_rl.config.recipe_files import find, shipped, shipped_conf
+from giril_rl.config.schema import (
+    ControlRunConfig,
+    ExpertRunConfig,
+    PPOConfig,
+    RunConfig,
+    TaskConfig,
+)
+from giril_rl.config.task_defaults import apply_task_defaults, task_defaults
 
 PONG, PENDULUM = "ALE/Pong-v5", "Pendulum-v1"
 RECIPES = [recipe.name for recipe in shipped()]

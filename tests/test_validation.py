@@ -3,7 +3,7 @@ from dataclasses import dataclass, field
 
 import pytest
 
-from giril_rl.configs import (
+from giril_rl.config.schema import (
     AdversarialConfig,
     CuriosityConfig,
     DemoConfig,
@@ -17,8 +17,8 @@ from giril_rl.configs import (
     TaskConfig,
     knob,
 )
+from giril_rl.config.validation import notices, validate
 from giril_rl.errors import UserError
-from giril_rl.validation import notices, validate
 
 
 @dataclass

@@ -31,7 +31,7 @@ from gymnasium import spaces
 from torchrl.envs import Compose
 
 from giril_rl import IntrinsicReward, ReturnScaling
-from giril_rl.configs import PPOConfig, TaskConfig
+from giril_rl.config.schema import PPOConfig, TaskConfig
 from giril_rl.demos import Demonstration, import_demonstration, subsample
 from giril_rl.envs import make_env
 from giril_rl.rewards import ConstantReward, GenerativeReward, GenerativeRewardLoss, fit

@@ -22,7 +22,7 @@ from torch import Tensor
 from torchrl.envs import Compose
 
 from giril_rl import IntrinsicReward, ReturnScaling, check_reward
-from giril_rl.configs import PPOConfig, TaskConfig
+from giril_rl.config.schema import PPOConfig, TaskConfig
 from giril_rl.demos import record_demonstration
 from giril_rl.envs import gym_factory, make_env
 from giril_rl.rewards import ConstantReward, ObservationScaler

@@ -7,9 +7,9 @@ from giril_rl.demos.minari import to_minari
 from giril_rl.demos.npz import to_npz
 from giril_rl.demos.record import record_demonstration
 from giril_rl.demos.replay import verify_by_replay
+from giril_rl.demos.shipped import shipped_demonstrations
 from giril_rl.demos.subsample import holdout, subsample
 from giril_rl.demos.task import named_task
-from giril_rl.shipped import shipped_demonstrations
 
 __all__ = [
     "Demonstration",

@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 
 from giril_rl.errors import UserError
-from giril_rl.files import sync
-from giril_rl.untrusted import check_memory
+from giril_rl.files.disk import sync
+from giril_rl.files.untrusted import check_memory
 
 FRAMES_FILE = "frames.npz"
 

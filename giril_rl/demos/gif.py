@@ -12,7 +12,7 @@ from torch import Tensor
 
 from giril_rl.demos.demonstration import Demonstration
 from giril_rl.errors import UserError
-from giril_rl.files import write_atomically
+from giril_rl.files.disk import write_atomically
 
 SCALE = 4
 

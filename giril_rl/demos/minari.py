@@ -20,7 +20,7 @@ from giril_rl.demos.demonstration import Demonstration
 from giril_rl.demos.minari_read import check_name, minari_root
 from giril_rl.demos.storage import check_room
 from giril_rl.errors import UserError
-from giril_rl.files import temporary_sibling, write_atomically
+from giril_rl.files.disk import temporary_sibling, write_atomically
 
 PART_BYTES = 16 * 2**20
 """Of a demonstration, handed to Minari at a time: what an export needs besides it."""

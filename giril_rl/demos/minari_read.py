@@ -17,7 +17,7 @@ import numpy as np
 from giril_rl.demos.arrays import from_episodes
 from giril_rl.demos.npz import MOST_PACKED
 from giril_rl.errors import UserError
-from giril_rl.untrusted import check_memory, parse_json, read_text
+from giril_rl.files.untrusted import check_memory, parse_json, read_text
 
 _NAME = re.compile(r"[-\w]+(/[-\w]+)*-v\d+", re.ASCII)
 _ARRAYS = {

@@ -5,8 +5,8 @@ from __future__ import annotations
 import re
 from collections.abc import Collection, Iterable, Sequence
 
+from giril_rl.config.nearest import nearest
 from giril_rl.errors import UserError
-from giril_rl.nearest import nearest
 
 _CALLED = {
     "obs": "observation",

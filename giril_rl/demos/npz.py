@@ -12,13 +12,13 @@ from typing import Any
 
 import numpy as np
 
+from giril_rl.config.nearest import did_you_mean
 from giril_rl.demos.arrays import NEEDED, from_episodes
 from giril_rl.demos.demonstration import Demonstration
 from giril_rl.demos.names import check_names, renamed
 from giril_rl.errors import UserError
-from giril_rl.files import sync, temporary_sibling
-from giril_rl.nearest import did_you_mean
-from giril_rl.untrusted import check_memory, parse_json
+from giril_rl.files.disk import sync, temporary_sibling
+from giril_rl.files.untrusted import check_memory, parse_json
 
 EPISODES = ("observations", "actions", "lengths", "terminated")
 _KNOWN = {*NEEDED, "reward", *EPISODES, "rewards", "card"}

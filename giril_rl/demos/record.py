@@ -20,9 +20,9 @@ from giril_rl.envs.checking import check_reset, check_step, env_name
 from giril_rl.envs.spaces import check_action_space
 from giril_rl.envs.stdout import silent_stdout
 from giril_rl.errors import UserError
-from giril_rl.files import installed_versions, processor
-from giril_rl.progress import progress
-from giril_rl.randomness import seeded, stream_seed
+from giril_rl.files.disk import installed_versions, processor
+from giril_rl.runs.progress import progress
+from giril_rl.runs.randomness import seeded, stream_seed
 
 _LONGEST_EPISODE = 1_000_000
 

@@ -14,8 +14,8 @@ import torch
 from tensordict import TensorDict
 
 from giril_rl.errors import UserError
-from giril_rl.files import sync
-from giril_rl.untrusted import check_memory, parse_json, read_text
+from giril_rl.files.disk import sync
+from giril_rl.files.untrusted import check_memory, parse_json, read_text
 
 _DTYPES = ("float32", "int64", "bool")
 _PAGE = 4096

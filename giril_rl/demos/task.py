@@ -9,13 +9,13 @@ from dataclasses import replace
 from omegaconf import OmegaConf
 from torchrl.data import TensorSpec
 
-from giril_rl.configs import TaskConfig, split_id
+from giril_rl.config.nearest import did_you_mean
+from giril_rl.config.recipe_files import shipped_conf
+from giril_rl.config.schema import TaskConfig, split_id
 from giril_rl.demos.check import check_demonstration
 from giril_rl.demos.demonstration import Demonstration
 from giril_rl.envs import make_env, with_own_episodes
 from giril_rl.errors import UserError
-from giril_rl.nearest import did_you_mean
-from giril_rl.recipes import shipped_conf
 
 _OPEN = ("atari", "gymnasium")  # These are completed by an id.
 

@@ -20,7 +20,7 @@ from giril_rl.envs.saved import (
     saved_tensor,
 )
 from giril_rl.errors import UserError
-from giril_rl.randomness import Use
+from giril_rl.runs.randomness import Use
 
 Episode = Literal["life", "game"]
 

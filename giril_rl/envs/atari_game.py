@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from giril_rl.config.nearest import did_you_mean
 from giril_rl.errors import UserError
-from giril_rl.nearest import did_you_mean
 
 SIDE = 84
 NOOP = 0

@@ -11,7 +11,7 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Categorical, Composite, TensorSpec, Unbounded
 from torchrl.envs import EnvBase
 
-from giril_rl.randomness import Use, stream_seed
+from giril_rl.runs.randomness import Use, stream_seed
 
 
 class BatchedEnv(EnvBase):

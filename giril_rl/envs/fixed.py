@@ -16,7 +16,7 @@ from giril_rl.envs.saved import saved_array
 from giril_rl.envs.spaces import shortest_limit
 from giril_rl.envs.vector import GymVectorEnv
 from giril_rl.errors import UserError
-from giril_rl.randomness import Use
+from giril_rl.runs.randomness import Use
 
 AfterFailure = Literal["reset", "continue"]
 

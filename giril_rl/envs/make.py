@@ -11,7 +11,8 @@ from typing import cast
 
 import gymnasium
 
-from giril_rl.configs import TaskConfig, split_id
+from giril_rl.config.nearest import did_you_mean
+from giril_rl.config.schema import TaskConfig, split_id
 from giril_rl.envs.atari import AtariEnv, Episode
 from giril_rl.envs.atari_game import FRAME_CAP
 from giril_rl.envs.atari_gym import AtariGymEnv
@@ -20,8 +21,7 @@ from giril_rl.envs.fixed import AfterFailure, FixedHorizonEnv
 from giril_rl.envs.stdout import silent_stdout
 from giril_rl.envs.vector import GymVectorEnv
 from giril_rl.errors import UserError
-from giril_rl.nearest import did_you_mean
-from giril_rl.randomness import Use
+from giril_rl.runs.randomness import Use
 
 BULLET = "BulletEnv"
 BULLET_PACKAGE = "pybullet_envs_gymnasium"

@@ -23,7 +23,7 @@ from giril_rl.envs.spaces import (
 )
 from giril_rl.envs.stdout import silent_stdout
 from giril_rl.errors import UserError
-from giril_rl.randomness import Use
+from giril_rl.runs.randomness import Use
 
 
 class GymVectorEnv(BatchedEnv):

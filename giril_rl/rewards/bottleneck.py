@@ -12,8 +12,6 @@ from torchrl.data import TensorSpec
 from giril_rl.networks.joined import JoinedSequential
 from giril_rl.networks.pixel_discriminators import PixelBottleneck
 from giril_rl.networks.vectors import mlp
-from giril_rl.pretrained import remembered
-from giril_rl.randomness import seeded
 from giril_rl.rewards.actions import ActionEncoder
 from giril_rl.rewards.adversarial import RewardForm
 from giril_rl.rewards.discriminator import (
@@ -24,6 +22,8 @@ from giril_rl.rewards.discriminator import (
 from giril_rl.rewards.keys import PAIR_KEYS, REWARD_KEYS
 from giril_rl.rewards.pixel_scaler import PixelScaler
 from giril_rl.rewards.transitions import check_output
+from giril_rl.runs.pretrained import remembered
+from giril_rl.runs.randomness import seeded
 
 
 class BottleneckReward(DiscriminatorReward):

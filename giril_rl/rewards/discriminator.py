@@ -17,8 +17,6 @@ from giril_rl.networks.joined import JoinedSequential
 from giril_rl.networks.normalise import RunningNormaliser
 from giril_rl.networks.pixel_discriminators import PixelDiscriminator
 from giril_rl.networks.vectors import mlp
-from giril_rl.pretrained import Pretrained, remembered
-from giril_rl.randomness import seeded
 from giril_rl.rewards.actions import ActionEncoder
 from giril_rl.rewards.adversarial import RewardForm, adversarial_reward
 from giril_rl.rewards.chunks import per_transition
@@ -26,6 +24,8 @@ from giril_rl.rewards.keys import PAIR_KEYS, REWARD_KEYS, check_keys
 from giril_rl.rewards.pixel_scaler import PixelScaler
 from giril_rl.rewards.scaler import ObservationScaler
 from giril_rl.rewards.transitions import check_actions, check_output, read
+from giril_rl.runs.pretrained import Pretrained, remembered
+from giril_rl.runs.randomness import seeded
 
 DiscriminatorScaling = Literal["running", "demo_range", "standardise", "raw"]
 

@@ -8,9 +8,9 @@ import torch
 from tensordict import TensorDictBase
 
 from giril_rl.errors import UserError
-from giril_rl.randomness import seeded
 from giril_rl.rewards.transition_loss import TransitionLoss
 from giril_rl.rewards.transitions import check_finite, check_transitions, read
+from giril_rl.runs.randomness import seeded
 
 
 def fit(

@@ -17,8 +17,6 @@ from giril_rl.networks.joined import JoinedSequential
 from giril_rl.networks.pixel_decoder import PixelDecoder
 from giril_rl.networks.pixels import PixelEncoder, PixelPrior
 from giril_rl.networks.vectors import mlp
-from giril_rl.pretrained import Pretrained, remembered
-from giril_rl.randomness import seeded
 from giril_rl.rewards.action_table import ActionTable
 from giril_rl.rewards.actions import ActionEncoder
 from giril_rl.rewards.chunks import per_transition
@@ -28,6 +26,8 @@ from giril_rl.rewards.keys import REWARD_KEYS, TRANSITION_KEYS, check_keys
 from giril_rl.rewards.pixel_scaler import PixelScaler
 from giril_rl.rewards.scaler import ObservationScaler, ScalingRule
 from giril_rl.rewards.transitions import check_output, check_transitions, read
+from giril_rl.runs.pretrained import Pretrained, remembered
+from giril_rl.runs.randomness import seeded
 
 Prior = Literal["standard", "conditional"]
 

@@ -1,9 +1,9 @@
 """The loops that recipes share: fit a reward, PPO on a reward, score, keep and resume."""
 
+from giril_rl.policies.agent import load_agent, make_agent
+from giril_rl.runs.run import Run
 from giril_rl.training.adversarial import AdversarialLearner
-from giril_rl.training.agent import load_agent, make_agent
 from giril_rl.training.clone import clone_behaviour
-from giril_rl.training.control_rewards import control_reward
 from giril_rl.training.evaluate import Scores, evaluate, evaluate_both
 from giril_rl.training.expert import check_inputs, check_task, obtain_demonstration, train_expert
 from giril_rl.training.fit import fit_reward
@@ -12,13 +12,6 @@ from giril_rl.training.ppo import PPOLearner, Trained, train_ppo
 from giril_rl.training.random_policy import RandomPolicy
 from giril_rl.training.result import finish_run
 from giril_rl.training.reward_learner import RewardLearner
-from giril_rl.training.reward_models import (
-    bottleneck_reward,
-    curiosity_reward,
-    discriminator_reward,
-    generative_reward,
-)
-from giril_rl.training.run import Run
 from giril_rl.training.scaling import return_scaling
 
 __all__ = [
@@ -30,19 +23,14 @@ __all__ = [
     "Run",
     "Scores",
     "Trained",
-    "bottleneck_reward",
     "check_discrete",
     "check_inputs",
     "check_task",
     "clone_behaviour",
-    "control_reward",
-    "curiosity_reward",
-    "discriminator_reward",
     "evaluate",
     "evaluate_both",
     "finish_run",
     "fit_reward",
-    "generative_reward",
     "held_action_scores",
     "load_agent",
     "make_agent",

@@ -12,21 +12,21 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor
 from torchrl.objectives import BCLoss
 
-from giril_rl.configs import BCConfig
+from giril_rl.config.schema import BCConfig
 from giril_rl.errors import UserError
-from giril_rl.networks.agents import Agent
 from giril_rl.networks.normalise import RunningNormaliser
-from giril_rl.networks.policy import NORMALISED
-from giril_rl.progress import progress
-from giril_rl.randomness import stream_seed
+from giril_rl.policies.agents import Agent
+from giril_rl.policies.policy import NORMALISED
 from giril_rl.rewards.chunks import PIXELS_AT_ONCE
-from giril_rl.training.finite import Finite
-from giril_rl.training.interrupt import Interrupt, Interrupted
+from giril_rl.runs.finite import Finite
+from giril_rl.runs.interrupt import Interrupt, Interrupted
+from giril_rl.runs.progress import progress
+from giril_rl.runs.randomness import stream_seed
+from giril_rl.runs.restoring import restoring
 from giril_rl.training.ppo import Trained
-from giril_rl.training.restoring import restoring
 
 if TYPE_CHECKING:
-    from giril_rl.training.run import Run
+    from giril_rl.runs.run import Run
 
 CHECKPOINT_EVERY = 1_000
 
@@ -154,7 +154,7 @@ def set_deviation(agent: Agent, pairs: TensorDictBase, least: float) -> None:
 
     Examples:
         >>> from torchrl.data import Bounded
-        >>> from giril_rl.networks.policy import ActorCritic
+        >>> from giril_rl.policies.policy import ActorCritic
         >>> agent = ActorCritic(1, Bounded(-1, 1, shape=(1,)), hidden=())
         >>> agent.actor[-1].weight.data.fill_(1.0)
         tensor([[1.]])

@@ -12,18 +12,18 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from giril_rl.configs import TaskConfig
+from giril_rl.config.schema import TaskConfig
 from giril_rl.envs import BatchedEnv, for_scores, make_env
-from giril_rl.networks.agents import check_actions
-from giril_rl.progress import progress
-from giril_rl.randomness import Use, seeded, stream_seed
+from giril_rl.policies.agents import check_actions
+from giril_rl.runs.progress import progress
+from giril_rl.runs.randomness import Use, seeded, stream_seed
 
 EPISODES_AT_ONCE = 20
 """Simulators that an evaluation has at a time; one of PyBullet's takes 30 MB."""
 
 
 class Player(Protocol):
-    """Whatever can be scored, such as :class:`~giril_rl.networks.policy.ActorCritic`."""
+    """Whatever can be scored, such as :class:`~giril_rl.policies.policy.ActorCritic`."""
 
     def acting(self) -> Callable[[TensorDictBase], TensorDictBase]:
         """What writes ``"action"`` for a batch of ``"observation"``."""
@@ -85,7 +85,7 @@ def evaluate(
         UserError: if the agent was made for other actions than the task's.
 
     Examples:
-        >>> from giril_rl.networks.policy import ActorCritic
+        >>> from giril_rl.policies.policy import ActorCritic
         >>> task = TaskConfig(name="cartpole", env_id="CartPole-v1")
         >>> env = make_env(task, num_envs=1, seed=0)
         >>> scores = evaluate(

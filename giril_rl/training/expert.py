@@ -18,24 +18,24 @@ from torch import Tensor
 from torchrl.envs import Compose, SignTransform
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from giril_rl.configs import DemoConfig, ExpertConfig, ExpertRunConfig, RunConfig, TaskConfig
+from giril_rl.config.imports import import_modules, modules_of
+from giril_rl.config.schema import DemoConfig, ExpertConfig, ExpertRunConfig, RunConfig, TaskConfig
+from giril_rl.config.task_defaults import apply_task_defaults
 from giril_rl.demos import Demonstration, check_demonstration, record_demonstration
+from giril_rl.demos.shipped import demonstration_folder
 from giril_rl.demos.task import as_recorded_task, check_environment, spaces_of
 from giril_rl.envs import gym_factory, make_env, with_own_episodes
 from giril_rl.errors import UserError
-from giril_rl.files import missing, remove_empty, remove_leftovers
-from giril_rl.imports import import_modules, modules_of
-from giril_rl.naming import NO_EFFECT, out_folder, safe, without_added
-from giril_rl.networks.agents import Agent
-from giril_rl.randomness import check_device
-from giril_rl.shipped import demonstration_folder
-from giril_rl.task_defaults import apply_task_defaults
-from giril_rl.training.agent import load_agent, make_agent
-from giril_rl.training.finished import read_result
+from giril_rl.files.disk import missing, remove_empty, remove_leftovers
+from giril_rl.policies.agent import load_agent, make_agent
+from giril_rl.policies.agents import Agent
+from giril_rl.runs.finished import read_result
+from giril_rl.runs.naming import NO_EFFECT, out_folder, safe, without_added
+from giril_rl.runs.randomness import check_device
+from giril_rl.runs.run import Run
 from giril_rl.training.outlook import announce
 from giril_rl.training.ppo import train_ppo
 from giril_rl.training.result import finish_run
-from giril_rl.training.run import Run
 from giril_rl.training.scaling import return_scaling
 
 REWARD = [("next", "reward")]

@@ -6,13 +6,13 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from giril_rl.configs import DemoConfig, ExpertConfig, RunConfig, TaskConfig
+from giril_rl.config.schema import DemoConfig, ExpertConfig, RunConfig, TaskConfig
 from giril_rl.demos import Demonstration
+from giril_rl.demos.shipped import demonstration_folder, is_shipped
 from giril_rl.errors import UserError
-from giril_rl.naming import config_hash
-from giril_rl.shipped import demonstration_folder, is_shipped
+from giril_rl.runs.finished import read_config, read_part, read_result
+from giril_rl.runs.naming import config_hash
 from giril_rl.training.expert import demonstration_place, expert_settings
-from giril_rl.training.finished import read_config, read_part, read_result
 
 
 def find_demonstration(folder: Path, within: Path) -> Demonstration | None:

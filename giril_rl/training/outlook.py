@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 
-from giril_rl.configs import DemoConfig, ExpertConfig, FitConfig, RunConfig
+from giril_rl.config.schema import DemoConfig, ExpertConfig, FitConfig, RunConfig
 
 STEPS_PER_SECOND = {"player": 6_000, "reward model": 3_000, "policy": 6_000}
 """Rough rates of one core of a server of 2023, for vectors."""
@@ -21,7 +21,7 @@ def outlook(cfg: RunConfig, expert: ExpertConfig, demo: DemoConfig, *, has_playe
         has_player: whether the player is there already.
 
     Examples:
-        >>> from giril_rl.configs import TaskConfig
+        >>> from giril_rl.config.schema import TaskConfig
         >>> cfg = RunConfig(task=TaskConfig(name="pong", env_id="ALE/Pong-v5"), steps=1_000_000)
         >>> print(outlook(cfg, ExpertConfig(), DemoConfig(), has_player=False))
         player: at most 5,000,000 steps, about 2.8 h; policy: 1,000,000 steps, about 33 min (rough

@@ -17,25 +17,25 @@ from torchrl.collectors import Collector
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
-from giril_rl.configs import PPOConfig
+from giril_rl.config.schema import PPOConfig
 from giril_rl.envs import BatchedEnv
 from giril_rl.errors import UserError
-from giril_rl.networks.agents import Agent, check_actions
-from giril_rl.progress import progress
-from giril_rl.randomness import Use, restore_rng, rng_state, stream_seed
-from giril_rl.training.acting import collecting
+from giril_rl.graphs.traced import TracedGradients
+from giril_rl.policies.agents import Agent, check_actions
+from giril_rl.policies.recorded_acting import collecting
+from giril_rl.runs.finite import Finite
+from giril_rl.runs.interrupt import Interrupt, Interrupted
+from giril_rl.runs.progress import progress
+from giril_rl.runs.randomness import Use, restore_rng, rng_state, stream_seed
+from giril_rl.runs.restoring import restoring
 from giril_rl.training.episodes import EpisodeTracker
-from giril_rl.training.finite import Finite
-from giril_rl.training.interrupt import Interrupt, Interrupted
-from giril_rl.training.restoring import restoring
 from giril_rl.training.threads import made_on_one_thread
-from giril_rl.training.traced import TracedGradients
 from giril_rl.transforms.batch_mean import BatchMeanReward
 from giril_rl.transforms.scaling import NonFiniteReward, ReturnScaling
 
 if TYPE_CHECKING:
+    from giril_rl.runs.run import Run
     from giril_rl.training.reward_learner import RewardLearner
-    from giril_rl.training.run import Run
 
 LEARNER_KEYS = ("action_log_prob", "advantage", "value_target")
 """What PPO's loss reads of a minibatch, besides the networks' inputs and the agent's draws."""

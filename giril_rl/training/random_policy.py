@@ -7,11 +7,11 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torchrl.data import Categorical, OneHot, TensorSpec
 
-from giril_rl.configs import TaskConfig
+from giril_rl.config.schema import TaskConfig
 from giril_rl.demos.task import spaces_of
 from giril_rl.errors import UserError
 from giril_rl.networks.action_bounds import affine_map, single_action_spec
-from giril_rl.randomness import stream_seed
+from giril_rl.runs.randomness import stream_seed
 
 RANDOM = "control:random"
 """The method's name in ``result.json``; such a run holds no policy."""

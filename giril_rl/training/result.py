@@ -8,25 +8,25 @@ from typing import Any
 
 from torch import nn
 
-from giril_rl.configs import ControlRunConfig, DemoConfig, RunConfig, UnaveragedRunConfig
+from giril_rl.config.schema import ControlRunConfig, DemoConfig, RunConfig, UnaveragedRunConfig
 from giril_rl.demos import Demonstration
-from giril_rl.files import processor
-from giril_rl.naming import config_hash
-from giril_rl.networks.agents import Agent
-from giril_rl.pretrained import Pretrained
-from giril_rl.report.curve import write_curve
-from giril_rl.report.losses import loss_points, write_losses
-from giril_rl.shipped import demonstration_name
-from giril_rl.training.agent import POLICY
+from giril_rl.demos.shipped import demonstration_name
+from giril_rl.files.disk import processor
+from giril_rl.policies.agent import POLICY
+from giril_rl.policies.agents import Agent
+from giril_rl.runs.curve import write_curve
+from giril_rl.runs.losses import loss_points, write_losses
+from giril_rl.runs.metrics import METRICS, read_metrics
+from giril_rl.runs.naming import config_hash
+from giril_rl.runs.pretrained import Pretrained
+from giril_rl.runs.run import Run
 from giril_rl.training.evaluate import evaluate_both
 from giril_rl.training.held_action import HeldAction
-from giril_rl.training.metrics import METRICS, read_metrics
 from giril_rl.training.ppo import Trained
 from giril_rl.training.random_policy import RandomPolicy
-from giril_rl.training.run import Run
 
 REWARD = "reward"
-"""The folder of a run that holds its reward module, see :class:`giril_rl.pretrained.Pretrained`."""
+"""The folder of a run that holds its reward, see :class:`giril_rl.runs.pretrained.Pretrained`."""
 CARD_KEYS = (
     "method",
     "task",

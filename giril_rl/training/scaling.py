@@ -6,7 +6,7 @@ from typing import cast
 
 from torchrl.envs import Transform
 
-from giril_rl.configs import ScalingConfig
+from giril_rl.config.schema import ScalingConfig
 from giril_rl.transforms import ReturnScaling
 from giril_rl.transforms.scaling import ResetRule
 

@@ -35,11 +35,11 @@ from stable_baselines3.common.env_util import make_atari_env
 from stable_baselines3.common.vec_env import VecFrameStack
 from torchrl.envs import Compose
 
-from giril_rl.allocator import keep_freed_memory
-from giril_rl.configs import RunConfig, TaskConfig
+from giril_rl.config.schema import RunConfig, TaskConfig
+from giril_rl.config.task_defaults import apply_task_defaults
 from giril_rl.envs import make_env
 from giril_rl.rewards import GenerativeReward
-from giril_rl.task_defaults import apply_task_defaults
+from giril_rl.runs.allocator import keep_freed_memory
 from giril_rl.training import Run, make_agent, train_ppo
 from giril_rl.transforms import BatchMeanReward, IntrinsicReward, ReturnScaling
 

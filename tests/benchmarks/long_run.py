@@ -53,7 +53,15 @@ def main() -> int:
         knobs = {word.split("=")[0]: word for word in ["steps=2000000000", *args.knobs]}
         place = f"root={temporary}", f"out={temporary}/run"
         process = subprocess.Popen(
-            [sys.executable, "-m", "giril_rl.cli", "run", args.recipe, *knobs.values(), *place],
+            [
+                sys.executable,
+                "-m",
+                "giril_rl.cli.command_line",
+                "run",
+                args.recipe,
+                *knobs.values(),
+                *place,
+            ],
             stdout=subprocess.DEVNULL,
         )
         rows = []

@@ -20,13 +20,13 @@ from torchrl.envs import GymWrapper
 from torchrl.modules import IndependentNormal
 from torchrl.objectives import ClipPPOLoss
 
-from giril_rl.configs import TaskConfig
+from giril_rl.config.schema import TaskConfig
 from giril_rl.envs import gym_factory, make_env
+from giril_rl.graphs.traced import TracedGradients
 from giril_rl.networks.distributions import DiagonalGaussian
-from giril_rl.networks.policy import NORMALISED, ActorCritic
-from giril_rl.training.acting import RecordedActing
+from giril_rl.policies.policy import NORMALISED, ActorCritic
+from giril_rl.policies.recorded_acting import RecordedActing
 from giril_rl.training.ppo import LEARNER_KEYS
-from giril_rl.training.traced import TracedGradients
 
 TASK = TaskConfig(name="inverted_pendulum", env_id="InvertedPendulumBulletEnv-v0")
 

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import torch
 
-from giril_rl.configs import FitConfig
+from giril_rl.config.schema import FitConfig
 from giril_rl.demos import Demonstration, named_task, shipped_demonstrations, subsample
 from giril_rl.envs import make_env
 from giril_rl.rewards import GenerativeReward, GenerativeRewardLoss

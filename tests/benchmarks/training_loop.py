@@ -24,7 +24,7 @@ from stable_baselines3 import PPO
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from torchrl.envs import Compose
 
-from giril_rl.configs import PPOConfig, TaskConfig
+from giril_rl.config.schema import PPOConfig, TaskConfig
 from giril_rl.envs import gym_factory, make_env
 from giril_rl.rewards import GenerativeReward
 from giril_rl.training import Run, make_agent, train_ppo

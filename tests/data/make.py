@@ -15,10 +15,10 @@ import torch
 from tensordict import TensorDict
 from torchrl.data import Bounded, Categorical
 
-from giril_rl.cli import main
+from giril_rl.cli.command_line import main
 from giril_rl.demos import Demonstration, record_demonstration
-from giril_rl.networks.pixel_policy import PixelActorCritic
-from giril_rl.networks.policy import ActorCritic
+from giril_rl.policies.pixel_policy import PixelActorCritic
+from giril_rl.policies.policy import ActorCritic
 from giril_rl.rewards import GenerativeReward
 
 WORDS = [

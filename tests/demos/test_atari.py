@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from giril_rl.configs import TaskConfig
+from giril_rl.config.schema import TaskConfig
 from giril_rl.demos import Demonstration, record_demonstration, to_minari, verify_by_replay
 from giril_rl.demos.record import episode_seed
 from giril_rl.demos.show import describe

@@ -11,7 +11,7 @@ from tensordict import TensorDict
 
 from giril_rl.demos import Demonstration, verify_by_replay
 from giril_rl.errors import UserError
-from giril_rl.files import write_json
+from giril_rl.files.disk import write_json
 
 
 class Bomb:

@@ -14,7 +14,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 import datasets
 
-from giril_rl.cli import main
+from giril_rl.cli.command_line import main
 from giril_rl.demos import Demonstration, record_demonstration, to_npz
 from giril_rl.demos.importing import import_demonstration
 from giril_rl.demos.task import named_task
@@ -242,7 +242,7 @@ def test_a_card_is_believed_only_where_it_has_the_right_form():
 
 
 def test_a_recipe_takes_what_was_imported():
-    from giril_rl.configs import DemoConfig, ExpertConfig, RunConfig
+    from giril_rl.config.schema import DemoConfig, ExpertConfig, RunConfig
     from giril_rl.training import check_inputs
 
     np.savez("foreign.npz", **datasets.whole())

@@ -43,7 +43,7 @@ from wrong import (
     without,
 )
 
-from giril_rl.cli import main
+from giril_rl.cli.command_line import main
 
 
 @pytest.fixture(autouse=True)

@@ -11,7 +11,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 from pixels import Pixels
 
-from giril_rl.cli import main
+from giril_rl.cli.command_line import main
 from giril_rl.demos import Demonstration, verify_by_replay
 from giril_rl.demos.play import KEYS, Window, action_of, play_demonstration
 from giril_rl.errors import UserError

@@ -5,13 +5,13 @@ from pathlib import Path
 
 import pytest
 
-from giril_rl.cli import main
-from giril_rl.configs import DemoConfig, ExpertConfig, RunConfig, TaskConfig
+from giril_rl.cli.command_line import main
+from giril_rl.config.schema import DemoConfig, ExpertConfig, RunConfig, TaskConfig
 from giril_rl.demos import Demonstration, named_task, shipped_demonstrations, verify_by_replay
+from giril_rl.demos.shipped import demonstration_folder, demonstration_name
 from giril_rl.demos.task import as_recorded_task, check_for_task
 from giril_rl.envs import gym_factory
 from giril_rl.errors import UserError
-from giril_rl.shipped import demonstration_folder, demonstration_name
 from giril_rl.training import check_inputs, obtain_demonstration
 
 PENDULUMS = ("inverted_double_pendulum", "inverted_pendulum")

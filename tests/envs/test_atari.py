@@ -10,13 +10,13 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torchrl.envs.utils import check_env_specs
 
-from giril_rl.configs import TaskConfig
+from giril_rl.config.recipe_files import shipped_conf
+from giril_rl.config.schema import TaskConfig
 from giril_rl.envs import AtariEnv, AtariGymEnv, for_scores, gym_factory, make_env
 from giril_rl.envs.atari import Opened
 from giril_rl.envs.atari_game import AtariGame
 from giril_rl.errors import UserError
-from giril_rl.randomness import stream_seed
-from giril_rl.recipes import shipped_conf
+from giril_rl.runs.randomness import stream_seed
 from giril_rl.training import evaluate
 
 ale_py = pytest.importorskip("ale_py")

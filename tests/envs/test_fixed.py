@@ -7,11 +7,11 @@ import torch
 from torchrl.collectors import Collector
 from torchrl.envs.utils import check_env_specs
 
-from giril_rl.configs import TaskConfig
+from giril_rl.config.schema import TaskConfig
 from giril_rl.envs import FixedHorizonEnv, GymVectorEnv, make_env, with_own_episodes
 from giril_rl.errors import UserError
-from giril_rl.randomness import stream_seed
-from giril_rl.training.checkpoint import load_state, save_state
+from giril_rl.files.checkpoint import load_state, save_state
+from giril_rl.runs.randomness import stream_seed
 
 KEYS = ["observation", "action"] + [
     ("next", name)

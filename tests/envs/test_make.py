@@ -1,7 +1,7 @@
 import gymnasium
 import pytest
 
-from giril_rl.configs import TaskConfig
+from giril_rl.config.schema import TaskConfig
 from giril_rl.envs import gym_factory, make_env
 from giril_rl.envs.make import _import
 from giril_rl.errors import UserError

@@ -7,9 +7,9 @@ import pytest
 import torch
 import yaml
 
-from giril_rl.configs import TaskConfig
+from giril_rl.config.recipe_files import shipped_conf
+from giril_rl.config.schema import TaskConfig
 from giril_rl.envs import gym_factory, make_env
-from giril_rl.recipes import shipped_conf
 
 # Observation, action, time limit, and whether a failure can end an episode.
 TASKS = {

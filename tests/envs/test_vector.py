@@ -12,13 +12,13 @@ from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import check_env_specs
 
-from giril_rl.configs import TaskConfig
+from giril_rl.config.schema import TaskConfig
 from giril_rl.demos import record_demonstration
 from giril_rl.envs import GymVectorEnv, make_env
 from giril_rl.errors import UserError
-from giril_rl.randomness import stream_seed
+from giril_rl.files.checkpoint import load_state, save_state
 from giril_rl.rewards.actions import ActionEncoder
-from giril_rl.training.checkpoint import load_state, save_state
+from giril_rl.runs.randomness import stream_seed
 
 BULLET = "InvertedPendulumBulletEnv-v0"
 KEYS = ["observation", "action"] + [

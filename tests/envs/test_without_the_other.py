@@ -18,7 +18,7 @@ import recipes.giril
 from giril_rl.demos import named_task
 from giril_rl.envs import make_env
 from giril_rl.training import evaluate, make_agent
-from giril_rl.configs import PPOConfig
+from giril_rl.config.schema import PPOConfig
 from dataclasses import replace
 
 task = replace(named_task({task!r}, None), max_episode_steps=20)

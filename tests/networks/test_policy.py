@@ -19,10 +19,10 @@ from torchrl.envs import GymEnv, GymWrapper
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from giril_rl.errors import UserError
-from giril_rl.networks.agents import load_agent_from
 from giril_rl.networks.normalise import RunningNormaliser
-from giril_rl.networks.pixel_policy import PixelActorCritic
-from giril_rl.networks.policy import NORMALISED, ActorCritic
+from giril_rl.policies.agents import load_agent_from
+from giril_rl.policies.pixel_policy import PixelActorCritic
+from giril_rl.policies.policy import NORMALISED, ActorCritic
 
 SPECS = {
     "box": Bounded(-1, 1, shape=(8, 2)),

@@ -7,10 +7,10 @@ import pytest
 import torch
 import yaml
 
-from giril_rl.cli import main
+from giril_rl.cli.command_line import main
 from giril_rl.demos import Demonstration
-from giril_rl.training.checkpoint import load_state
-from giril_rl.training.metrics import read_metrics
+from giril_rl.files.checkpoint import load_state
+from giril_rl.runs.metrics import read_metrics
 
 pytest.importorskip("ale_py")
 

@@ -6,13 +6,13 @@ import math
 import gymnasium
 import pytest
 
-from giril_rl.cli import main
-from giril_rl.configs import TaskConfig
+from giril_rl.cli.command_line import main
+from giril_rl.config.recipe_files import copy, find
+from giril_rl.config.schema import TaskConfig
 from giril_rl.envs import GymVectorEnv, make_env
-from giril_rl.recipes import copy, find
-from giril_rl.training.checkpoint import load_state
-from giril_rl.training.metrics import read_metrics
-from giril_rl.training.run import Run
+from giril_rl.files.checkpoint import load_state
+from giril_rl.runs.metrics import read_metrics
+from giril_rl.runs.run import Run
 
 REWARDS = [
     *("constant", "untrained_giril", "untrained_icm", "copy", "noise", "negated_giril"),

@@ -2,7 +2,7 @@ import csv
 
 import matplotlib.pyplot as plt
 
-from giril_rl.report.curve import curve_points, write_curve
+from giril_rl.runs.curve import curve_points, write_curve
 
 ROWS = [
     {"phase": "fit", "step": 500, "fit/loss": 0.5},

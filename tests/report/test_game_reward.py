@@ -6,8 +6,8 @@ import torch
 from tensordict import TensorDict
 from torchrl.data import Categorical
 
-from giril_rl.report.game import Game
-from giril_rl.report.game_reward import draw_game, rewards_of
+from giril_rl.experiments.report.game import Game
+from giril_rl.experiments.report.game_reward import draw_game, rewards_of
 from giril_rl.rewards import GenerativeReward
 
 STEPS = 300

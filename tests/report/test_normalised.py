@@ -2,11 +2,11 @@
 
 import pytest
 
-from giril_rl.report.normalised import what_is_missing
-from giril_rl.report.origins import intervals_text
-from giril_rl.report.rows import panels_of
-from giril_rl.report.runs import read_runs
-from giril_rl.report.tables import tables_of
+from giril_rl.experiments.report.normalised import what_is_missing
+from giril_rl.experiments.report.origins import intervals_text
+from giril_rl.experiments.report.rows import panels_of
+from giril_rl.experiments.report.runs import read_runs
+from giril_rl.experiments.report.tables import tables_of
 
 
 def panel(made):

@@ -2,7 +2,7 @@
 
 import pytest
 
-from giril_rl.report.paper import _tables, paper_figure
+from giril_rl.experiments.report.paper import _tables, paper_figure
 
 GAMES = ["space_invaders", "beam_rider", "breakout", "qbert", "seaquest", "kung_fu_master"]
 PENDULUMS = ["inverted_pendulum", "inverted_double_pendulum"]

@@ -6,18 +6,18 @@ import sys
 
 import pytest
 
-from giril_rl.cli import main
-from giril_rl.configs import DemoConfig, ExpertConfig, GenerativeConfig, PPOConfig, RunConfig
+from giril_rl.cli.command_line import main
+from giril_rl.config.schema import DemoConfig, ExpertConfig, GenerativeConfig, PPOConfig, RunConfig
 from giril_rl.demos import record_demonstration
 from giril_rl.envs import gym_factory, make_env
-from giril_rl.naming import config_hash
-from giril_rl.report.pictures import _is_generative
-from giril_rl.report.rows import panels_of
-from giril_rl.report.runs import read_runs
+from giril_rl.experiments.report.pictures import _is_generative
+from giril_rl.experiments.report.rows import panels_of
+from giril_rl.experiments.report.runs import read_runs
 from giril_rl.rewards import GenerativeReward
+from giril_rl.runs.finished import read_config, read_part, read_settings
+from giril_rl.runs.naming import config_hash
 from giril_rl.training import make_agent
 from giril_rl.training.expert import demonstration_place, expert_settings
-from giril_rl.training.finished import read_config, read_part, read_settings
 
 WORDS = ("task=breakout", "task.max_episode_steps=20")
 

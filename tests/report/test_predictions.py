@@ -6,7 +6,7 @@ import torch
 from tensordict import TensorDict
 from torchrl.data import Categorical
 
-from giril_rl.report.predictions import draw_predictions, foresee
+from giril_rl.experiments.report.predictions import draw_predictions, foresee
 from giril_rl.rewards import GenerativeReward
 
 NAMES = ["NOOP", "FIRE", "DOWNRIGHTFIRE"]

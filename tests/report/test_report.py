@@ -6,10 +6,10 @@ import json
 import numpy as np
 import pytest
 
-from giril_rl.cli import main
-from giril_rl.report.curves import binned_curve, row_curves
-from giril_rl.report.rows import panels_of
-from giril_rl.report.runs import read_runs
+from giril_rl.cli.command_line import main
+from giril_rl.experiments.report.curves import binned_curve, row_curves
+from giril_rl.experiments.report.rows import panels_of
+from giril_rl.experiments.report.runs import read_runs
 
 
 @pytest.fixture

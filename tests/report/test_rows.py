@@ -3,11 +3,11 @@
 import pytest
 import yaml
 
-from giril_rl.report.formats import seeds_text
-from giril_rl.report.rows import panels_of
-from giril_rl.report.runs import read_runs
-from giril_rl.report.style import PALETTE
-from giril_rl.report.tables import tables_of
+from giril_rl.experiments.report.formats import seeds_text
+from giril_rl.experiments.report.rows import panels_of
+from giril_rl.experiments.report.runs import read_runs
+from giril_rl.experiments.report.style import PALETTE
+from giril_rl.experiments.report.tables import tables_of
 
 
 def panels(made):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from giril_rl.errors import UserError
-from giril_rl.report.statistics import (
+from giril_rl.experiments.report.statistics import (
     band,
     iqm,
     load_rliable,
@@ -43,7 +43,7 @@ def test_intervals_are_those_of_rliable(tasks):
 
 
 def test_with_many_seeds_the_interval_is_the_normal_one(monkeypatch):
-    monkeypatch.setattr("giril_rl.report.statistics.RESAMPLES", 4_000)
+    monkeypatch.setattr("giril_rl.experiments.report.statistics.RESAMPLES", 4_000)
     values = np.random.default_rng(1).normal(100, 10, 400)
     mean, _ = mean_and_iqm(values)
     assert mean.low < values.mean() < mean.high

@@ -6,13 +6,13 @@ from torch import nn
 from torchrl.data import Bounded, Categorical, OneHot
 
 from giril_rl.errors import UserError
+from giril_rl.graphs.traced import TracedGradients
 from giril_rl.rewards import (
     ActionEncoder,
     CuriosityReward,
     CuriosityRewardLoss,
     ObservationScaler,
 )
-from giril_rl.training.traced import TracedGradients
 
 SPECS = {"box": Bounded(-2.0, 2.0, shape=(2,)), "discrete": Categorical(4), "one_hot": OneHot(4)}
 PARTS = ("features", "inverse_model", "forward_model")

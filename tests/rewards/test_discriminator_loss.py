@@ -8,6 +8,7 @@ from torchrl.data import Bounded, Categorical, OneHot
 from torchrl.objectives import GAILLoss
 
 from giril_rl.errors import UserError
+from giril_rl.graphs.traced import TracedGradients
 from giril_rl.rewards import (
     BottleneckLoss,
     BottleneckReward,
@@ -15,7 +16,6 @@ from giril_rl.rewards import (
     DiscriminatorReward,
 )
 from giril_rl.rewards.adversarial import gradient_penalty
-from giril_rl.training.traced import TracedGradients
 
 SPECS = {"box": Bounded(-1.0, 1.0, shape=(2,)), "discrete": Categorical(4), "one_hot": OneHot(4)}
 

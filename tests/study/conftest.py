@@ -20,9 +20,9 @@ from pathlib import Path
 
 import yaml
 
-from giril_rl.configs import RunConfig, knob
+from giril_rl.config.schema import RunConfig, knob
 from giril_rl.errors import UserError
-from giril_rl.naming import config_hash
+from giril_rl.runs.naming import config_hash
 
 HOW = ("well", "user", "bug", "once", "killed", "slow", "stubborn")
 
@@ -56,7 +56,7 @@ def main(cfg: Config, out: Path) -> None:
             raise
     (out / "result.json").write_text(json.dumps({"config_hash": config_hash(cfg)}))
     # What prints the scores imports torch, which takes far longer than the rest.
-    light = types.ModuleType("giril_rl.training.finished")
+    light = types.ModuleType("giril_rl.runs.finished")
     light.print_scores = lambda folder: print("scores of", folder)
     sys.modules[light.__name__] = light
 '''
@@ -76,7 +76,7 @@ def study(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     # The fake recipe puts another module in this one's place; in this process only for one test.
     monkeypatch.setitem(sys.modules, finished.__name__, finished)
-    monkeypatch.setattr("giril_rl.study.execute.PAUSE", 0.01)
+    monkeypatch.setattr("giril_rl.experiments.study.execute.PAUSE", 0.01)
     Path("fake.py").write_text(RECIPE)
     Path("fake.yaml").write_text(SETTINGS)
 

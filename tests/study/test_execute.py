@@ -13,10 +13,10 @@ import pytest
 import yaml
 from filelock import FileLock
 
-from giril_rl.cli import main
-from giril_rl.study.execute import startable
-from giril_rl.study.plan import Planner
-from giril_rl.study.spec import read_spec
+from giril_rl.cli.command_line import main
+from giril_rl.experiments.study.execute import startable
+from giril_rl.experiments.study.plan import Planner
+from giril_rl.experiments.study.spec import read_spec
 
 FOLDER = Path("runs/studies/mine")
 
@@ -128,7 +128,7 @@ def found(marker):
 def interrupted(name, *, times):
     """Runs a study of slow runs and interrupts it, again once they know; its code and its words."""
     process = subprocess.Popen(
-        [sys.executable, "-m", "giril_rl.cli", "study", name, "jobs=2"],
+        [sys.executable, "-m", "giril_rl", "study", name, "jobs=2"],
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,
         text=True,
@@ -179,7 +179,7 @@ def test_a_second_ctrl_c_kills(study):
 def test_runs_of_a_study_that_is_killed_save_and_stop(study):
     name = study("groups: [{label: a, recipe: fake.py, how: slow, seed: [0, 1]}]")
     process = subprocess.Popen(
-        [sys.executable, "-m", "giril_rl.cli", "study", name, "jobs=2"],
+        [sys.executable, "-m", "giril_rl", "study", name, "jobs=2"],
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),

@@ -8,8 +8,8 @@ from types import ModuleType, SimpleNamespace
 import pytest
 
 from giril_rl.errors import UserError
-from giril_rl.study.local import LocalLauncher
-from giril_rl.study.on_ray import RayLauncher
+from giril_rl.experiments.study.local import LocalLauncher
+from giril_rl.experiments.study.on_ray import RayLauncher
 
 
 def a_run(name, device="cuda"):
@@ -37,20 +37,20 @@ def ray(monkeypatch):
 
 
 def test_ray_is_asked_for_a_part_of_a_gpu(ray):
-    launcher = RayLauncher("auto", per_gpu=4)
+    launcher = RayLauncher(len, "auto", per_gpu=4)
     assert launcher.slots == 8
     launcher.start(a_run("a"), Path("a.log"))
     launcher.start(a_run("b", device="cpu"), Path("b.log"))
     assert [asked["num_gpus"] for asked in ray.asked] == [0.25, 0]
     assert [asked["num_cpus"] for asked in ray.asked] == [2, 2]
-    assert RayLauncher("auto").slots == 16
+    assert RayLauncher(len, "auto").slots == 16
 
 
 def test_a_cluster_without_a_gpu_is_refused(ray):
     ray.resources = {"CPU": 16.0}
     with pytest.raises(UserError, match="has no GPU"):
-        RayLauncher("auto", per_gpu=1)
-    assert RayLauncher("auto").slots == 16
+        RayLauncher(len, "auto", per_gpu=1)
+    assert RayLauncher(len, "auto").slots == 16
 
 
 def test_local_runs_share_the_gpus_evenly(monkeypatch, tmp_path):
@@ -69,7 +69,7 @@ def test_local_runs_share_the_gpus_evenly(monkeypatch, tmp_path):
     monkeypatch.setattr("subprocess.Popen", Process)
     monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "3,5")
     monkeypatch.setattr("os.sched_getaffinity", lambda _: range(32), raising=False)
-    launcher = LocalLauncher(["3", "5"], per_gpu=3)
+    launcher = LocalLauncher(["giril"], ["3", "5"], per_gpu=3)
     assert launcher.slots == 6
     for name in "abc":
         launcher.start(a_run(name), tmp_path / "log")
@@ -79,4 +79,4 @@ def test_local_runs_share_the_gpus_evenly(monkeypatch, tmp_path):
     launcher.poll()
     launcher.start(a_run("e"), tmp_path / "log")  # In the place of the one that has ended.
     assert seen[-1] == "5"
-    assert LocalLauncher().slots == 32
+    assert LocalLauncher([]).slots == 32

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from giril_rl.cli import main
+from giril_rl.cli.command_line import main
 
 STUDY = """
 all:
@@ -39,8 +39,10 @@ def test_a_worker_makes_a_run_as_the_command_does(study):
         .replace('if cfg.how == "user"', 'os.write(1, b"bare")\n    if cfg.how == "user"')
     )
     code = (
-        "from giril_rl.study.on_ray import run_in_worker as run; import sys;"
-        f"sys.exit(run(['run', 'fake.py', 'how=user'], {str(Path('logs/a.log').absolute())!r}, "
+        "from giril_rl.experiments.study.on_ray import run_in_worker as run; import sys;"
+        "from giril_rl.cli.command_line import main;"
+        "sys.exit(run(main, ['run', 'fake.py', 'how=user'], "
+        f"{str(Path('logs/a.log').absolute())!r}, "
         f"{str(Path.cwd())!r}))"
     )
     done = subprocess.run([sys.executable, "-c", code], cwd="/", capture_output=True, text=True)
@@ -80,8 +82,8 @@ def test_a_cluster_gives_the_same_results_though_a_worker_dies(study):
     status = json.loads(Path("there/studies/mine/status.json").read_text())
     assert sorted(run["attempts"] for run in status["runs"]) == [1, 2]
 
-    from giril_rl.training.checkpoint import load_state
-    from giril_rl.training.metrics import read_metrics
+    from giril_rl.files.checkpoint import load_state
+    from giril_rl.runs.metrics import read_metrics
 
     for here in Path("here").rglob("result.json"):
         there = Path("there") / here.relative_to("here")

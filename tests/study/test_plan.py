@@ -6,13 +6,13 @@ from pathlib import Path
 
 import pytest
 
-from giril_rl.cli import main
-from giril_rl.compose import groups
+from giril_rl.cli.command_line import main
+from giril_rl.config.compose import groups
+from giril_rl.config.recipe_files import find
 from giril_rl.errors import UserError
-from giril_rl.naming import config_hash, out_folder
-from giril_rl.recipes import find
-from giril_rl.study.plan import Planner
-from giril_rl.study.spec import find_study, read_spec, shipped_studies
+from giril_rl.experiments.study.plan import Planner
+from giril_rl.experiments.study.spec import find_study, read_spec, shipped_studies
+from giril_rl.runs.naming import config_hash, out_folder
 from giril_rl.training.expert import expert_settings
 
 

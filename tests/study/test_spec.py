@@ -2,9 +2,9 @@ from pathlib import Path
 
 import pytest
 
+from giril_rl.config.overrides import parse, sweep
 from giril_rl.errors import UserError
-from giril_rl.overrides import parse, sweep
-from giril_rl.study.spec import override_text, read_spec, shipped_studies
+from giril_rl.experiments.study.spec import override_text, read_spec, shipped_studies
 
 GROUP = "groups: [{label: a, recipe: fake.py}]\n"
 

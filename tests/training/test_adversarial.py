@@ -10,21 +10,21 @@ from tensordict import TensorDict
 from torchrl.data import Bounded, Categorical
 from torchrl.envs import Compose
 
-from giril_rl.configs import AdversarialConfig, PPOConfig
+from giril_rl.config.schema import AdversarialConfig, PPOConfig
 from giril_rl.envs import GymVectorEnv
+from giril_rl.files.checkpoint import load_state, save_state
+from giril_rl.policies.agent import make_agent
 from giril_rl.rewards import (
     BottleneckLoss,
     BottleneckReward,
     DiscriminatorLoss,
     DiscriminatorReward,
 )
+from giril_rl.runs.interrupt import Interrupted
+from giril_rl.runs.metrics import read_metrics
+from giril_rl.runs.run import Run
 from giril_rl.training.adversarial import AdversarialLearner
-from giril_rl.training.agent import make_agent
-from giril_rl.training.checkpoint import load_state, save_state
-from giril_rl.training.interrupt import Interrupted
-from giril_rl.training.metrics import read_metrics
 from giril_rl.training.ppo import train_ppo
-from giril_rl.training.run import Run
 from giril_rl.transforms import IntrinsicReward, ReturnScaling
 
 SPECS = {"box": Bounded(-1.0, 1.0, shape=(4, 1)), "discrete": Categorical(2, shape=(4,))}

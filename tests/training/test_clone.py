@@ -7,15 +7,15 @@ from tensordict import TensorDict
 from torchrl.data import Bounded, Categorical, OneHot
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from giril_rl.configs import BCConfig
+from giril_rl.config.schema import BCConfig
 from giril_rl.errors import UserError
-from giril_rl.networks.policy import NORMALISED, ActorCritic
+from giril_rl.files.checkpoint import load_state
+from giril_rl.policies.policy import NORMALISED, ActorCritic
+from giril_rl.runs.interrupt import Interrupted
+from giril_rl.runs.metrics import read_metrics
+from giril_rl.runs.run import Run
 from giril_rl.training import clone
-from giril_rl.training.checkpoint import load_state
 from giril_rl.training.clone import clone_behaviour
-from giril_rl.training.interrupt import Interrupted
-from giril_rl.training.metrics import read_metrics
-from giril_rl.training.run import Run
 
 BOX, DISCRETE = Bounded(-1, 1, shape=(1, 2)), Categorical(3, shape=(1,))
 GAIN = torch.tensor([[0.3, -0.2], [0.1, 0.4], [0.0, 0.2]])

@@ -2,7 +2,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from giril_rl.configs import (
+from giril_rl.config.schema import (
     ControlRunConfig,
     CuriosityConfig,
     DemoConfig,
@@ -12,7 +12,7 @@ from giril_rl.configs import (
 )
 from giril_rl.demos import Demonstration
 from giril_rl.envs import make_env
-from giril_rl.randomness import stream_seed
+from giril_rl.methods.control_rewards import control_reward, moments
 from giril_rl.rewards import (
     AffineReward,
     ConstantReward,
@@ -21,9 +21,9 @@ from giril_rl.rewards import (
     GenerativeReward,
     NoiseReward,
 )
-from giril_rl.training.control_rewards import control_reward, moments
-from giril_rl.training.metrics import read_metrics
-from giril_rl.training.run import Run
+from giril_rl.runs.metrics import read_metrics
+from giril_rl.runs.randomness import stream_seed
+from giril_rl.runs.run import Run
 
 TASK = TaskConfig(name="cartpole", env_id="CartPole-v1")
 

@@ -5,7 +5,7 @@ import pytest
 import torch
 from tensordict.nn import TensorDictModule
 
-from giril_rl.configs import DemoConfig, ExpertConfig, RunConfig, TaskConfig
+from giril_rl.config.schema import DemoConfig, ExpertConfig, RunConfig, TaskConfig
 from giril_rl.demos import Demonstration
 from giril_rl.demos.task import as_recorded_task
 from giril_rl.errors import UserError

@@ -6,17 +6,17 @@ from tensordict import TensorDict
 from torch import nn
 from torchrl.data import Bounded, Categorical
 
-from giril_rl.configs import FitConfig
+from giril_rl.config.schema import FitConfig
 from giril_rl.rewards import (
     CuriosityReward,
     CuriosityRewardLoss,
     GenerativeReward,
     GenerativeRewardLoss,
 )
+from giril_rl.runs.interrupt import Interrupted
+from giril_rl.runs.metrics import read_metrics
+from giril_rl.runs.run import Run
 from giril_rl.training import fit
-from giril_rl.training.interrupt import Interrupted
-from giril_rl.training.metrics import read_metrics
-from giril_rl.training.run import Run
 
 SPECS = {"box": Bounded(-1, 1, shape=(1, 1)), "discrete": Categorical(3, shape=(1,))}
 TERMS = ("reconstruction", "kl", "action")

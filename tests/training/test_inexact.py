@@ -8,14 +8,14 @@ from gymnasium.wrappers import TimeLimit
 from torch import nn
 from torchrl.envs import Compose
 
-from giril_rl.configs import EvalConfig, PPOConfig, RunConfig, TaskConfig
+from giril_rl.config.schema import EvalConfig, PPOConfig, RunConfig, TaskConfig
 from giril_rl.envs import GymVectorEnv
+from giril_rl.files.checkpoint import load_state
+from giril_rl.runs.metrics import read_metrics
+from giril_rl.runs.result_file import read_result_file
 from giril_rl.training import RandomPolicy, Run, Trained, finish_run, make_agent, train_ppo
-from giril_rl.training.checkpoint import load_state
 from giril_rl.training.episodes import EpisodeTracker
-from giril_rl.training.metrics import read_metrics
 from giril_rl.training.ppo import forget_episodes
-from giril_rl.training.result_file import read_result_file
 from giril_rl.transforms import ReturnScaling
 
 BATCH = 4 * 32

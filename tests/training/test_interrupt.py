@@ -3,7 +3,7 @@ import threading
 
 import pytest
 
-from giril_rl.training.interrupt import Interrupt, Interrupted
+from giril_rl.runs.interrupt import Interrupt, Interrupted
 
 
 @pytest.fixture(autouse=True)

@@ -7,8 +7,8 @@ from types import ModuleType, SimpleNamespace
 
 import pytest
 
-from giril_rl.training.interrupt import Interrupted
-from giril_rl.training.run import Run
+from giril_rl.runs.interrupt import Interrupted
+from giril_rl.runs.run import Run
 
 
 class FakeWandb(ModuleType):

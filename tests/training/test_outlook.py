@@ -1,6 +1,6 @@
 """What a run says of its length before it begins."""
 
-from giril_rl.configs import DemoConfig, ExpertConfig, FitConfig, RunConfig, TaskConfig
+from giril_rl.config.schema import DemoConfig, ExpertConfig, FitConfig, RunConfig, TaskConfig
 from giril_rl.training.outlook import announce, outlook
 
 BREAKOUT = TaskConfig(name="breakout", env_id="ALE/Breakout-v5", expert_steps=9_000_000)

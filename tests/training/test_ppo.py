@@ -10,18 +10,18 @@ from torch import nn
 from torchrl.data import Bounded, Categorical, OneHot
 from torchrl.envs import Compose
 
-from giril_rl.configs import PPOConfig, TaskConfig
+from giril_rl.config.schema import PPOConfig, TaskConfig
 from giril_rl.envs import GymVectorEnv, make_env
 from giril_rl.errors import UserError
-from giril_rl.networks.pixel_policy import PixelActorCritic
-from giril_rl.networks.policy import NORMALISED, ActorCritic
+from giril_rl.files.checkpoint import load_state
+from giril_rl.policies.agent import make_agent
+from giril_rl.policies.pixel_policy import PixelActorCritic
+from giril_rl.policies.policy import NORMALISED, ActorCritic
 from giril_rl.rewards import GenerativeReward
-from giril_rl.training.agent import make_agent
-from giril_rl.training.checkpoint import load_state
-from giril_rl.training.interrupt import Interrupted
-from giril_rl.training.metrics import read_metrics
+from giril_rl.runs.interrupt import Interrupted
+from giril_rl.runs.metrics import read_metrics
+from giril_rl.runs.run import Run
 from giril_rl.training.ppo import PPOLearner, train_ppo
-from giril_rl.training.run import Run
 from giril_rl.transforms import BatchMeanReward, IntrinsicReward, ReturnScaling
 
 BULLET = "InvertedPendulumBulletEnv-v0"

@@ -10,15 +10,15 @@ from torch.utils._pytree import tree_flatten
 from torchrl.envs import Compose
 from torchrl.objectives.value import GAE
 
-from giril_rl.configs import PPOConfig
+from giril_rl.config.schema import PPOConfig
 from giril_rl.envs import AtariEnv
-from giril_rl.networks.pixel_policy import PixelActorCritic
+from giril_rl.policies.agent import make_agent
+from giril_rl.policies.pixel_policy import PixelActorCritic
 from giril_rl.rewards import GenerativeReward
-from giril_rl.training.agent import make_agent
-from giril_rl.training.interrupt import Interrupted
-from giril_rl.training.metrics import read_metrics
+from giril_rl.runs.interrupt import Interrupted
+from giril_rl.runs.metrics import read_metrics
+from giril_rl.runs.run import Run
 from giril_rl.training.ppo import PPOLearner, train_ppo
-from giril_rl.training.run import Run
 from giril_rl.transforms import BatchMeanReward, IntrinsicReward, ReturnScaling
 
 GAMMA, LMBDA = 0.9, 0.8

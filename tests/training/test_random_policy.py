@@ -5,7 +5,7 @@ import torch
 from tensordict import TensorDict
 from torchrl.data import Bounded, Categorical, MultiCategorical, OneHot, Unbounded
 
-from giril_rl.configs import TaskConfig
+from giril_rl.config.schema import TaskConfig
 from giril_rl.errors import UserError
 from giril_rl.training import HeldAction, RandomPolicy
 from giril_rl.training.evaluate import evaluate

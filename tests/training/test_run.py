@@ -10,8 +10,8 @@ import torch
 import yaml
 
 from giril_rl.errors import UserError
-from giril_rl.training.metrics import check_logger, read_metrics
-from giril_rl.training.run import Run
+from giril_rl.runs.metrics import check_logger, read_metrics
+from giril_rl.runs.run import Run
 
 CONFIG = {"seed": 0, "out": "a", "ppo": {"lr": 3e-4, "hidden": [100, 100], "clip": 0.1}}
 
@@ -124,7 +124,7 @@ def test_leftovers_of_a_kill_are_no_foreign_files(tmp_path):
 
 def test_folder_is_held_by_one_at_a_time(tmp_path):
     code = (
-        "import sys\nfrom giril_rl.training.run import Run\nfrom giril_rl.errors import UserError\n"
+        "import sys\nfrom giril_rl.runs.run import Run\nfrom giril_rl.errors import UserError\n"
         "try:\n    Run.open(sys.argv[1], {}, recipe='x')\nexcept UserError as e:\n    print(e)"
     )
     with Run.open(tmp_path, {}, recipe="x"):

@@ -10,9 +10,11 @@ from torchrl.data import Bounded, Categorical
 from torchrl.envs import Compose
 from torchrl.objectives.value import GAE
 
-from giril_rl.configs import AdversarialConfig, PPOConfig
-from giril_rl.networks.pixel_policy import PixelActorCritic
-from giril_rl.networks.policy import ActorCritic
+from giril_rl.config.schema import AdversarialConfig, PPOConfig
+from giril_rl.graphs.recorded import record
+from giril_rl.graphs.traced import TracedGradients
+from giril_rl.policies.pixel_policy import PixelActorCritic
+from giril_rl.policies.policy import ActorCritic
 from giril_rl.rewards import (
     AffineReward,
     BottleneckLoss,
@@ -33,8 +35,6 @@ from giril_rl.rewards.actions import ActionEncoder
 from giril_rl.rewards.fitting import fit
 from giril_rl.training import AdversarialLearner, recorded
 from giril_rl.training.ppo import PPOLearner
-from giril_rl.training.recorded import record
-from giril_rl.training.traced import TracedGradients
 from giril_rl.transforms import BatchMeanReward, IntrinsicReward, ReturnScaling
 
 ENVS, TIME = 2, 8

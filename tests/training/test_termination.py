@@ -7,16 +7,16 @@ from torch import nn
 from torchrl.data import Bounded
 from torchrl.envs import Compose
 
-from giril_rl.configs import PPOConfig, TaskConfig
+from giril_rl.config.recipe_files import shipped
+from giril_rl.config.schema import PPOConfig, TaskConfig
 from giril_rl.envs import make_env
 from giril_rl.errors import UserError
-from giril_rl.networks.policy import ActorCritic
-from giril_rl.recipes import shipped
-from giril_rl.training.agent import make_agent
+from giril_rl.policies.agent import make_agent
+from giril_rl.policies.policy import ActorCritic
+from giril_rl.runs.metrics import read_metrics
+from giril_rl.runs.run import Run
 from giril_rl.training.evaluate import evaluate
-from giril_rl.training.metrics import read_metrics
 from giril_rl.training.ppo import PPOLearner, train_ppo
-from giril_rl.training.run import Run
 from giril_rl.transforms import ReturnScaling
 
 

@@ -7,10 +7,10 @@ from torch import nn
 from torchrl.data import Bounded, Categorical
 from torchrl.objectives import ClipPPOLoss
 
-from giril_rl.networks.policy import NORMALISED, ActorCritic
+from giril_rl.graphs.traced import TracedGradients
+from giril_rl.policies.policy import NORMALISED, ActorCritic
 from giril_rl.rewards import GenerativeReward, GenerativeRewardLoss
 from giril_rl.training.ppo import LEARNER_KEYS, RecordableClipPPOLoss
-from giril_rl.training.traced import TracedGradients
 
 SPECS = {"box": Bounded(-1, 1, shape=(1, 2)), "discrete": Categorical(3, shape=(1,))}
 LOG = ("kl_approx", "clip_fraction")

@@ -70,8 +70,8 @@ def serve():
     import torch
     import torchrl.collectors  # noqa: F401
 
-    import giril_rl.report.curve
-    import giril_rl.study.command
+    import giril_rl.cli.study
+    import giril_rl.runs.curve
     import giril_rl.training  # noqa: F401
     from giril_rl.envs.stdout import silent_stdout
 
@@ -104,7 +104,7 @@ def live(order):
         os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
         from points import Points
 
-        from giril_rl.cli import main
+        from giril_rl.cli.command_line import main
 
         points = Points(**order["points"]) if order["points"] else None
         if points is not None:

@@ -15,13 +15,13 @@ from folders import assert_readable, assert_same, contents
 from tiny import RECIPES, words
 from torch import nn
 
-from giril_rl.configs import BCConfig, FitConfig, PPOConfig, TaskConfig
+from giril_rl.config.schema import BCConfig, FitConfig, PPOConfig, TaskConfig
 from giril_rl.demos import record_demonstration
 from giril_rl.envs import GymVectorEnv, gym_factory, make_env
 from giril_rl.errors import FAILED, RunError
+from giril_rl.files.checkpoint import load_state
 from giril_rl.rewards import GenerativeReward, GenerativeRewardLoss
 from giril_rl.training import Run, clone_behaviour, fit_reward, make_agent, train_ppo
-from giril_rl.training.checkpoint import load_state
 from giril_rl.transforms import ReturnScaling
 
 TASK = TaskConfig(name="cartpole", env_id="CartPole-v1")
@@ -255,7 +255,7 @@ def begun(folder):
     root = folder / "runs of this test"
     command = ["study", str(folder / "mine.yaml"), "jobs=2", "retries=0", f"root='{root}'"]
     process = subprocess.Popen(
-        [sys.executable, "-m", "giril_rl.cli", *command],
+        [sys.executable, "-m", "giril_rl", *command],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,

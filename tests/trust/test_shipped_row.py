@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 from safetensors.torch import load_file
 
-from giril_rl.cli import main
-from giril_rl.files import installed_versions, processor, read_json
-from giril_rl.training.metrics import read_metrics
+from giril_rl.cli.command_line import main
+from giril_rl.files.disk import installed_versions, processor, read_json
+from giril_rl.runs.metrics import read_metrics
 
 KEPT = read_json(Path(__file__).resolve().parents[1] / "data" / "short_row.json")
 """The words of the run, where it was made, the digest of its weights and some of its numbers.

@@ -63,8 +63,8 @@ def spoilt_demonstration(change):
 
 def run_folder(change=lambda folder: None, finished=True):
     """The kept run as if made here, changed."""
-    from giril_rl.files import installed_versions, write_json
-    from giril_rl.formats import RUN_FORMAT
+    from giril_rl.files.disk import installed_versions, write_json
+    from giril_rl.files.formats import RUN_FORMAT
 
     def ready(folder):
         (folder / ".lock").touch()

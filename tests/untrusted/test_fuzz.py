@@ -10,15 +10,15 @@ from files import DATA
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from giril_rl.compose import resolved
+from giril_rl.config.compose import resolved
+from giril_rl.config.leaves import leaves
+from giril_rl.config.overrides import parse
+from giril_rl.config.recipe_config import config_class
+from giril_rl.config.recipe_files import find
 from giril_rl.errors import UserError
-from giril_rl.overrides import parse
-from giril_rl.recipe_config import config_class
-from giril_rl.recipes import find
-from giril_rl.schema import leaves
-from giril_rl.study.spec import read_spec
-from giril_rl.training.checkpoint import load_state
-from giril_rl.untrusted import parse_json, parse_yaml
+from giril_rl.experiments.study.spec import read_spec
+from giril_rl.files.checkpoint import load_state
+from giril_rl.files.untrusted import parse_json, parse_yaml
 
 GIRIL = find("giril")
 CONFIG = config_class(GIRIL)
@@ -68,8 +68,8 @@ def test_any_value_of_any_key_is_taken_or_refused(key, value):
 @settings(here, max_examples=40)
 @given(st.floats().filter(lambda number: not 0 < number <= 1))
 def test_no_beta_outside_its_range_is_taken(beta):
-    from giril_rl.configs import GenerativeConfig
-    from giril_rl.validation import validate
+    from giril_rl.config.schema import GenerativeConfig
+    from giril_rl.config.validation import validate
 
     with pytest.raises(UserError, match=r"^beta="):
         validate(GenerativeConfig(beta=beta))

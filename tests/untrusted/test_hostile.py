@@ -23,9 +23,9 @@ from files import (
     written,
 )
 
-from giril_rl.cli import main
+from giril_rl.cli.command_line import main
 from giril_rl.errors import UserError
-from giril_rl.training.checkpoint import load_state, save_state
+from giril_rl.files.checkpoint import load_state, save_state
 
 CALL = '!!python/object/apply:os.system ["touch mark"]'
 BOMB = "\n".join(

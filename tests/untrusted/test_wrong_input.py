@@ -28,7 +28,7 @@ from files import (
     written,
 )
 
-from giril_rl.cli import main
+from giril_rl.cli.command_line import main
 
 DEEP = '{"a":' * 50_000 + "1" + "}" * 50_000
 
@@ -86,7 +86,7 @@ def number(name, value, row=3):
 
 def checkpoint(change):
     def rewrite(folder):
-        from giril_rl.training.checkpoint import load_state, save_state
+        from giril_rl.files.checkpoint import load_state, save_state
 
         state = load_state(folder / "ppo.safetensors")
         save_state(folder / "ppo.safetensors", change(state))
@@ -475,7 +475,7 @@ def test_wrong_input_is_refused_in_one_sentence_and_changes_nothing(case, here, 
 
 @pytest.mark.parametrize("argv", [["run", "giril", "seed=x"], ["eval", "nowhere"]])
 def test_a_traceback_is_shown_only_when_asked_for(argv, here):
-    command = [sys.executable, "-m", "giril_rl.cli", *argv]
+    command = [sys.executable, "-m", "giril_rl", *argv]
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 2 and done.stderr.count("\n") == 1
     asked = subprocess.run([*command, "--traceback"], capture_output=True, text=True)

@@ -1,0 +1,448 @@
+"""The typed knobs of every recipe, one dataclass for each part.
+
+A field's type is what Hydra enforces, its default is the value used, its ``help`` is the line that
+``giril run RECIPE --help`` shows, and its ``choices`` or bounds are what
+:func:`giril_rl.config.validation.validate` checks. Nothing heavy is imported here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from omegaconf import MISSING
+
+MOST = 2**63 - 1
+"""The largest whole number of any knob: what torch takes for a seed or a size, and files keep."""
+MOST_THREADS = 1024
+COMPILE = "torch.compile of gradient steps: for long training on frames, 20 seconds to begin"
+
+
+def knob(
+    default: Any,
+    help: str,
+    *,
+    choices: Sequence[str] | None = None,
+    low: float | None = None,
+    high: float | None = None,
+    low_open: bool = False,
+    high_open: bool = False,
+) -> Any:
+    """A dataclass field with a default, one line of help and what its value may be.
+
+    Args:
+        default: value used when nothing else is said; ``MISSING`` makes the knob mandatory.
+        help: one line, shown by ``--help``.
+        choices: the only texts allowed.
+        low: smallest number allowed; in a list, of each entry.
+        high: largest number allowed; in a list, of each entry.
+        low_open: ``low`` itself is not allowed.
+        high_open: ``high`` itself is not allowed.
+
+    Examples:
+        >>> from dataclasses import dataclass, fields
+        >>> @dataclass
+        ... class Part:
+        ...     beta: float = knob(1.0, "a weight in (0, 1]", low=0, high=1, low_open=True)
+        >>> Part().beta, fields(Part)[0].metadata["help"]
+        (1.0, 'a weight in (0, 1]')
+    """
+    metadata = {
+        "help": help,
+        "choices": tuple(choices) if choices else None,
+        "low": low,
+        "high": high,
+        "low_open": low_open,
+        "high_open": high_open,
+    }
+    if isinstance(default, list):
+        return field(default_factory=lambda: list(default), metadata=metadata)
+    return field(default=default, metadata=metadata)
+
+
+def split_id(env_id: str) -> tuple[str | None, str]:
+    """The module that registers an id, where it is named as Gymnasium has it, and the id proper.
+
+    Examples:
+        >>> split_id("my_envs:Ball-v0"), split_id("Pendulum-v1")
+        (('my_envs', 'Ball-v0'), (None, 'Pendulum-v1'))
+    """
+    module, colon, name = env_id.rpartition(":")
+    return (module if colon else None), name
+
+
+def is_atari(env_id: str) -> bool:
+    """Whether a Gymnasium id is one of the Arcade Learning Environment.
+
+    Examples:
+        >>> is_atari("ALE/Pong-v5"), is_atari("Pendulum-v1")
+        (True, False)
+    """
+    return split_id(env_id)[1].startswith("ALE/")
+
+
+@dataclass
+class TaskConfig:
+    """The environment and what is known about it."""
+
+    name: str = knob(MISSING, "name of the task, used for folders and tables")
+    env_id: str = knob(
+        MISSING,
+        "Gymnasium id, or MODULE:ID of a module of yours; vector observation or ALE/..., Box or "
+        "Discrete",
+    )
+    max_episode_steps: int | None = knob(
+        None, "time limit; null takes the one registered for the id (Atari: 27,000)", low=1
+    )
+    steps: int = knob(1_000_000, "default policy steps for this task", low=1)
+    demonstration: str | None = knob(
+        None, "what demo.path is where neither it nor an expert or a recording is asked for"
+    )
+    expert_score: float | None = knob(None, "mean training return at which the expert stops early")
+    expert_steps: int = knob(
+        5_000_000, "most environment steps of the task's expert (paper: 5M)", low=1
+    )
+    horizon: str = knob(
+        "own",
+        "own: a failure ends an episode; fixed: only the time limit does (policy training only)",
+        choices=("own", "fixed"),
+    )
+    after_failure: str = knob(
+        "reset",
+        "horizon=fixed: reset the simulator unnoticed, or continue from where it failed",
+        choices=("reset", "continue"),
+    )
+    episode: str = knob(
+        "life",
+        "Atari: a lost life ends an episode of training, or only the game's end does",
+        choices=("life", "game"),
+    )
+
+    @property
+    def is_atari(self) -> bool:
+        """Whether the environment is one of the Arcade Learning Environment."""
+        return is_atari(self.env_id)
+
+
+@dataclass
+class PPOConfig:
+    """Proximal policy optimisation, as the paper's continuous control experiments set it."""
+
+    num_envs: int = knob(16, "parallel environments", low=1)
+    rollout: int = knob(125, "steps per environment between updates", low=1)
+    epochs: int = knob(10, "passes over each batch", low=1)
+    minibatch: int = knob(250, "transitions per gradient step; divides num_envs * rollout", low=1)
+    lr: float = knob(3e-4, "Adam step size", low=0, low_open=True)
+    anneal_lr: bool = knob(False, "decrease the step size linearly to zero")
+    clip: float = knob(0.1, "clipping range of the probability ratio", low=0, low_open=True)
+    value_coef: float = knob(0.5, "weight of the squared value error", low=0)
+    clip_value: bool = knob(False, "clip the change of the value by the same range (Atari)")
+    entropy_coef: float = knob(0.0, "weight of the entropy bonus", low=0)
+    gamma: float = knob(0.99, "discount", low=0, high=1)
+    lmbda: float = knob(0.95, "lambda of generalised advantage estimation", low=0, high=1)
+    max_grad_norm: float = knob(
+        0.5, "gradient norm above which gradients are scaled down", low=0, low_open=True
+    )
+    hidden: list[int] = knob([100, 100], "hidden layers of policy and value network (tanh)", low=1)
+    normalise_observations: bool = knob(True, "running observation normalisation, clipped at 10")
+    checkpoint_every: int = knob(100_000, "environment steps between checkpoints", low=1)
+    compile: bool = knob(False, f"{COMPILE}; of the acting policy as well")
+
+    def whole_batches(self, steps: int) -> int:
+        """``steps``, rounded up to the end of a batch.
+
+        Examples:
+            >>> PPOConfig(num_envs=16, rollout=125).whole_batches(15_000)
+            16000
+        """
+        batch = self.num_envs * self.rollout
+        return -(-steps // batch) * batch
+
+
+@dataclass
+class ExpertConfig:
+    """The player whose demonstration is imitated: PPO on the true reward."""
+
+    steps: int | None = knob(
+        None, "most environment steps of expert training; null takes task.expert_steps", low=1
+    )
+    seed: int | None = knob(None, "seed of the expert; null takes the run's seed", low=0)
+    stop_early: bool = knob(True, "stop once the mean return reaches task.expert_score")
+    path: str | None = knob(None, "folder of a finished expert run to use instead of training one")
+
+    def steps_on(self, task: TaskConfig) -> int:
+        """Most environment steps of this expert's training on ``task``."""
+        return task.expert_steps if self.steps is None else self.steps
+
+
+@dataclass
+class DemoConfig:
+    """What is recorded from the expert and how much of it is used."""
+
+    path: str | None = knob(
+        None,
+        "folder of a demonstration to use; `shipped` takes the package's own, the one of the run's "
+        "seed, `shipped:NAME/2` a given one; null records one; the task decides by default",
+    )
+    length: int | None = knob(
+        1000, "transitions to record; null records `episodes` whole episodes", low=1
+    )
+    episodes: int | None = knob(None, "whole episodes to record (then length must be null)", low=1)
+    lives: str = knob(
+        "first",
+        "Atari: an episode goes up to the first lost life, or through all lives",
+        choices=("first", "all"),
+    )
+    deterministic: bool = knob(True, "play the expert's mean action rather than a sampled one")
+    seed: int | None = knob(None, "seed of the recorded episodes; null takes the run's seed", low=0)
+    subsample: int = knob(20, "keep 1 in k transitions, fixed once (paper: 20; 1 keeps all)", low=1)
+
+
+@dataclass
+class GenerativeConfig:
+    """GIRIL's conditional VAE and the reward made of it."""
+
+    beta: float = knob(
+        1.0,
+        "weight of the true action against the encoded one, in (0, 1]",
+        low=0,
+        high=1,
+        low_open=True,
+    )
+    alpha: float | None = knob(
+        None, "weight of the action term; null: 1 for Box, 100 for Discrete", low=0
+    )
+    scale: float = knob(1.0, "lambda, the weight of the squared error", low=0, low_open=True)
+    prior: str = knob(
+        "standard",
+        "latent prior: standard N(0, I) or conditional p(z | s)",
+        choices=("standard", "conditional"),
+    )
+    normalise: str = knob(
+        "standardise",
+        "observation rule of the reward model",
+        choices=("demo_range", "standardise", "raw", "pixels"),
+    )
+    clamp: bool = knob(True, "clamp observations to [-1, 1], those of normalise=raw too")
+    hidden: list[int] = knob([100, 100], "hidden layers of encoder and decoder (tanh)", low=1)
+    seed: int | None = knob(None, "seed of the reward model; null takes the run's seed", low=0)
+
+
+@dataclass
+class AdversarialConfig:
+    """GAIL's discriminator, its training and the reward made of it."""
+
+    form: str = knob(
+        "positive",
+        "reward of D = P(expert): positive -log(1-D), negative log D, log_ratio, reversed -log D",
+        choices=("positive", "negative", "log_ratio", "reversed"),
+    )
+    lr: float = knob(1e-3, "Adam step size (paper: 1e-3)", low=0, low_open=True)
+    updates: int = knob(10, "gradient steps with each batch of PPO", low=1)
+    batch: int = knob(250, "most pairs of expert and of policy in each gradient step", low=1)
+    penalty: float = knob(1.0, "weight of the gradient penalty; 0 leaves it out", low=0)
+    normalise: str = knob(
+        "standardise",
+        "observation rule: running statistics of the policy, or one of the demonstration",
+        choices=("running", "demo_range", "standardise", "raw", "pixels"),
+    )
+    clamp: float | None = knob(
+        10.0, "bound on normalised observations; null has none", low=0, low_open=True
+    )
+    hidden: list[int] = knob([100, 100], "hidden layers of the discriminator (tanh)", low=1)
+    seed: int | None = knob(None, "seed of the discriminator; null takes the run's seed", low=0)
+    compile: bool = knob(False, COMPILE)
+
+
+@dataclass
+class BottleneckConfig(AdversarialConfig):
+    """VAIL's discriminator with its information bottleneck."""
+
+    penalty: float = knob(0.0, "weight of the gradient penalty; 0 leaves it out", low=0)
+    information: float = knob(0.5, "I_c, nats through the bottleneck (paper: 0.5)", low=0)
+    latent: int = knob(8, "size of the bottleneck's code", low=1)
+    beta_start: float = knob(0.0, "first weight of the constraint", low=0)
+    beta_step: float = knob(1e-2, "dual step on that weight for each nat too many", low=0)
+
+
+@dataclass
+class CuriosityConfig:
+    """CDIL's intrinsic curiosity module and the reward made of it."""
+
+    features: str = knob(
+        "inverse",
+        "what trains the features: L_I alone, L_I + L_F, or nothing (random, as released)",
+        choices=("inverse", "both", "none"),
+    )
+    scale: float = knob(1.0, "lambda, the weight of the squared error", low=0, low_open=True)
+    normalise: str = knob(
+        "standardise",
+        "observation rule of the reward model",
+        choices=("demo_range", "standardise", "raw", "pixels"),
+    )
+    clamp: bool = knob(True, "clamp observations to [-1, 1], those of normalise=raw too")
+    hidden: list[int] = knob([100, 100], "layers of the features (tanh); [] takes none", low=1)
+    model_hidden: list[int] = knob(
+        [100], "hidden layers of inverse and forward model (tanh)", low=1
+    )
+    seed: int | None = knob(None, "seed of the reward model; null takes the run's seed", low=0)
+
+
+@dataclass
+class FitConfig:
+    """Training of a reward model on the demonstration."""
+
+    steps: int = knob(50_000, "gradient steps", low=0)
+    batch: int = knob(32, "transitions per gradient step", low=1)
+    lr: float = knob(3e-5, "Adam step size", low=0, low_open=True)
+    log_every: int = knob(500, "gradient steps between logged losses", low=1)
+    compile: bool = knob(False, COMPILE)
+
+
+@dataclass
+class BCConfig:
+    """Behaviour cloning: the policy fitted to the demonstrated actions."""
+
+    stop: str = knob(
+        "held_out",
+        "held_out: keep the weights that are best on held-out transitions; fixed: the last ones",
+        choices=("held_out", "fixed"),
+    )
+    steps: int = knob(5_000, "gradient steps", low=1)
+    batch: int = knob(
+        100, "transitions per gradient step; where there are no more, all of them", low=1
+    )
+    lr: float = knob(3e-3, "AdamW step size, decreasing linearly to zero", low=0, low_open=True)
+    weight_decay: float = knob(1.0, "AdamW's weight decay, times the step size", low=0)
+    min_scale: float = knob(0.07, "smallest deviation that observations are divided by", low=0)
+    min_std: float = knob(
+        0.01,
+        "Box: smallest deviation of sampled actions, in units of half their range",
+        low=0,
+        low_open=True,
+    )
+    log_every: int = knob(
+        100, "gradient steps between logged losses, where held-out ones are compared", low=1
+    )
+
+
+@dataclass
+class ScalingConfig:
+    """Division of rewards by the running deviation of their discounted return."""
+
+    enabled: bool = knob(True, "scale the reward")
+    reset: str = knob(
+        "never", "when to forget the running return of an episode", choices=("never", "done")
+    )
+    clip: float | None = knob(
+        10.0, "clip scaled rewards to plus or minus this; null does not", low=0, low_open=True
+    )
+
+
+@dataclass
+class EvalConfig:
+    """Scoring on fresh environments, whole episodes, true reward."""
+
+    episodes: int = knob(20, "episodes for each of the deterministic and the sampled policy", low=1)
+    seed: int = knob(10_000, "seed of the evaluation episodes", low=0)
+
+
+@dataclass
+class RunConfig:
+    """What all recipes share."""
+
+    task: TaskConfig = field(default_factory=TaskConfig)
+    profile: str = knob(
+        "released",
+        "released (reward averaged over environments) or paper (eq. 2)",
+        choices=("released", "paper"),
+    )
+    batch_mean: bool = knob(
+        True, "average each step's reward over the environments (profile released)"
+    )
+    seed: int = knob(0, "seed of the policy's training", low=0)
+    steps: int = knob(MISSING, "policy environment steps", low=1)
+    out: str | None = knob(
+        None, "the run's folder; null makes a name from recipe, task and changes"
+    )
+    root: str = knob("runs", "where runs, experts and demonstrations are kept")
+    imports: list[str] = knob(
+        [], "modules of yours that register environments; found here and beside the recipe"
+    )
+    logger: str | None = knob(
+        "tensorboard",
+        "where curves go besides the run's own files; null nowhere",
+        choices=("tensorboard", "csv", "wandb", "mlflow"),
+    )
+    threads: int = knob(
+        1, "torch threads; small networks are fastest with 1", low=1, high=MOST_THREADS
+    )
+    device: str = knob(
+        "cpu",
+        "where networks and batches are; environments stay on the CPU",
+        choices=("cpu", "cuda"),
+    )
+    termination: str = knob(
+        "ends",
+        "ends: nothing comes after a failure; bootstrap: its value continues as after a time limit",
+        choices=("ends", "bootstrap"),
+    )
+    ppo: PPOConfig = field(default_factory=PPOConfig)
+    eval: EvalConfig = field(default_factory=EvalConfig)
+
+
+@dataclass
+class UnaveragedRunConfig(RunConfig):
+    """What recipes share that never average a reward: both profiles give the same run."""
+
+    profile: str = knob(
+        "released",
+        "no effect here: nothing is averaged, both profiles are the same run",
+        choices=("released", "paper"),
+    )
+    batch_mean: bool = knob(True, "no effect here")
+
+
+@dataclass
+class ExpertRunConfig(UnaveragedRunConfig):
+    """What the expert's own recipe takes: PPO on the true reward."""
+
+    steps: int = knob(5_000_000, "most environment steps of expert training (paper: 5M)", low=1)
+    stop_early: bool = knob(True, "stop once the mean return reaches task.expert_score")
+    clip_reward: bool = knob(False, "learn from the reward's sign (Atari); scores are unclipped")
+    scaling: ScalingConfig = field(default_factory=lambda: ScalingConfig(reset="done"))
+
+
+@dataclass
+class ControlRunConfig(RunConfig):
+    """What the controls' recipe takes; what the chosen reward has no use for is not read."""
+
+    reward: str = knob(
+        "constant",
+        "the reward that stands in for a learned one; random: no reward, a random policy's score; "
+        "held_action: no reward, the score of one action all the time, the best one",
+        choices=(
+            "constant",
+            "untrained_giril",
+            "untrained_icm",
+            "copy",
+            "noise",
+            "negated_giril",
+            "centred_giril",
+            "random",
+            "held_action",
+        ),
+    )
+    held_episodes: int = knob(20, "held_action: episodes that choose the action", low=1)
+    expert: ExpertConfig = field(default_factory=ExpertConfig)
+    demo: DemoConfig = field(default_factory=DemoConfig)
+    giril: GenerativeConfig = field(default_factory=GenerativeConfig)
+    icm: CuriosityConfig = field(default_factory=CuriosityConfig)
+    fit: FitConfig = field(default_factory=FitConfig)
+    scaling: ScalingConfig = field(default_factory=ScalingConfig)
+
+    @property
+    def needs_demonstration(self) -> bool:
+        """Whether the control is made of a demonstration, and so of an expert."""
+        return self.reward not in ("constant", "random", "held_action")

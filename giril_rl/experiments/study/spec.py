@@ -1,0 +1,188 @@
+"""A study's YAML: groups of runs, each a recipe with its knobs, a list of values sweeping."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from giril_rl.config.leaves import flat
+from giril_rl.config.nearest import did_you_mean
+from giril_rl.config.recipe_files import shipped_conf
+from giril_rl.errors import UserError
+from giril_rl.files.untrusted import check_yaml, read_text
+
+_KEYS = ("title", "all", "groups")
+
+
+@dataclass(frozen=True)
+class Group:
+    """Runs of one label: every combination of the recipes and of the knobs' values.
+
+    Attributes:
+        label: the group's name.
+        recipes: names of recipes or paths of copied ones.
+        knobs: ``{dotted key: value}``; see :func:`override_text` for lists.
+        player: whether its runs are the experts that the others record, which the command line's
+            ``steps=`` is not for.
+    """
+
+    label: str
+    recipes: tuple[str, ...]
+    knobs: dict[str, Any]
+    player: bool = False
+
+
+@dataclass(frozen=True)
+class Spec:
+    """A study as it is written down.
+
+    Attributes:
+        name: the file's name without its suffix.
+        title: one line about it.
+        groups: its groups, each with the knobs that all of them have.
+    """
+
+    name: str
+    title: str
+    groups: tuple[Group, ...]
+
+
+def shipped_studies() -> dict[str, Path]:
+    """The studies that come with the package, by name.
+
+    Examples:
+        >>> "smoke" in shipped_studies()
+        True
+    """
+    return {path.stem: path for path in sorted((shipped_conf() / "study").glob("*.yaml"))}
+
+
+def find_study(text: str) -> Path:
+    """The file of the study that a user named: a shipped one's name, or a path.
+
+    Raises:
+        UserError: for an unknown name or a missing file.
+
+    Examples:
+        >>> find_study("smok")
+        Traceback (most recent call last):
+        ...
+        giril_rl.errors.UserError: 'smok' is not a study; did you mean 'smoke'?
+    """
+    if text.endswith((".yaml", ".yml")):
+        path = Path(text)
+        if not path.is_file():
+            raise UserError(f"there is no file {text}: write the study there, or name another.")
+        return path
+    known = shipped_studies()
+    if text not in known:
+        hint = did_you_mean(text, known)
+        hint = hint or f": choose one of {', '.join(known)}, or give the path of a .yaml file."
+        raise UserError(f"{text!r} is not a study{hint}")
+    return known[text]
+
+
+def read_spec(path: Path) -> Spec:
+    """Read a study's file; its knobs are checked later, by their recipes.
+
+    Raises:
+        UserError: where the file is not valid YAML or not a study.
+    """
+    content = _load(path)
+    for key in content:
+        if key not in _KEYS:
+            hint = did_you_mean(str(key), _KEYS) or f": a study has {', '.join(_KEYS)}."
+            raise UserError(f"{path}: {key!r} is not a key of a study{hint}")
+    shared, groups = content.get("all") or {}, content.get("groups")
+    if not isinstance(shared, dict):
+        raise UserError(f"{path}: `all` holds knobs that all groups have, as key: value.")
+    if not isinstance(groups, list) or not groups:
+        raise UserError(f"{path}: `groups` is missing: list at least one, with label and recipe.")
+    found = tuple(_group(path, number, entry, shared) for number, entry in enumerate(groups, 1))
+    for label in {group.label for group in found}:
+        if sum(group.label == label for group in found) > 1:
+            raise UserError(f"{path}: two groups have the label {label!r}: give each its own.")
+    return Spec(path.stem, str(content.get("title") or ""), found)
+
+
+def _load(path: Path) -> dict[str, Any]:
+    import yaml
+    from omegaconf import DictConfig, OmegaConf
+    from omegaconf.errors import OmegaConfBaseException
+
+    try:
+        check_yaml(read_text(path))
+        # OmegaConf's reader knows 1e-4 for a number and refuses a key that is given twice.
+        loaded = OmegaConf.load(path)
+        content = OmegaConf.to_container(loaded, resolve=False)
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        line = f", line {mark.line + 1}" if mark else ""
+        problem = getattr(error, "problem", None) or "not valid YAML"
+        raise UserError(f"{path}{line}: {problem}; correct it.") from error
+    except (OSError, ValueError, OmegaConfBaseException) as error:
+        raise UserError(f"{path} cannot be read as YAML: {str(error).splitlines()[0]}.") from error
+    if not isinstance(loaded, DictConfig) or not isinstance(content, dict):
+        raise UserError(f"{path} is not a study: it needs `groups`, a list.")
+    return content  # type: ignore[return-value]
+
+
+def _group(path: Path, number: int, entry: Any, shared: Mapping[str, Any]) -> Group:
+    if not isinstance(entry, dict) or not isinstance(entry.get("label"), str):
+        raise UserError(f"{path}: group {number} has no label: give it one, label: TEXT.")
+    own = dict(entry)
+    label, recipes, player = own.pop("label"), own.pop("recipe", None), own.pop("player", False)
+    if not isinstance(player, bool):
+        raise UserError(f"{path}: group {label!r} has player: {player}: write true or false.")
+    recipes = recipes if isinstance(recipes, list) else [recipes]
+    if not recipes or not all(isinstance(name, str) for name in recipes):
+        raise UserError(f"{path}: group {label!r} has no recipe: give one, or a list of them.")
+    return Group(label, tuple(recipes), {**flat(shared), **flat(own)}, player)
+
+
+def override_text(key: str, value: Any, *, is_list: bool = False) -> str:
+    """A knob of a study as ``key=value``, in the grammar of ``giril run -m``.
+
+    A list of values sweeps. For a knob that is itself a list, a list is one value and a list of
+    lists sweeps. Text is taken as it would be on the command line, or quoted where it could not be.
+
+    Args:
+        key: the knob's dotted key.
+        value: its value in the YAML.
+        is_list: whether the knob holds a list.
+
+    Examples:
+        >>> override_text("seed", [0, 1]), override_text("demo.length", None)
+        ('seed=0,1', 'demo.length=null')
+        >>> override_text("ppo.hidden", [16, 16], is_list=True)
+        'ppo.hidden=[16,16]'
+        >>> override_text("demo.path", "old runs, (two)")
+        "demo.path='old runs, (two)'"
+    """
+    sweeps = isinstance(value, list) and (not is_list or any(isinstance(v, list) for v in value))
+    entries = value if sweeps else [value]
+    return f"{key}=" + ",".join(_text(key, entry, alone=len(entries) == 1) for entry in entries)
+
+
+def _text(key: str, value: Any, *, alone: bool) -> str:
+    if value is None:
+        return "null"
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, list):
+        return "[" + ",".join(_text(key, entry, alone=False) for entry in value) + "]"
+    text = str(value)
+    return text if _readable(f"{key}={text}", alone=alone) else "'" + text.replace("'", "\\'") + "'"
+
+
+def _readable(text: str, *, alone: bool) -> bool:
+    from giril_rl.config.overrides import parse
+
+    try:
+        (override,) = parse([text])
+    except UserError:
+        return False
+    # Beside other values, text that is itself a list of values would become more of them.
+    return alone or not override.is_sweep_override()

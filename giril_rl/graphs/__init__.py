@@ -1,0 +1,1 @@
+"""A gradient step recorded or compiled as one graph."""

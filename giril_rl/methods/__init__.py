@@ -1,0 +1,19 @@
+"""What each method is made of."""
+
+from giril_rl.methods.control_rewards import control_reward
+from giril_rl.methods.reward_models import (
+    bottleneck_reward,
+    copy_reward,
+    curiosity_reward,
+    discriminator_reward,
+    generative_reward,
+)
+
+__all__ = [
+    "bottleneck_reward",
+    "control_reward",
+    "copy_reward",
+    "curiosity_reward",
+    "discriminator_reward",
+    "generative_reward",
+]

@@ -1,0 +1,1 @@
+"""Actors and critics, and the policy that collects."""
