@@ -24,7 +24,7 @@ from giril_rl.files.disk import (
     write_json,
 )
 from giril_rl.files.formats import RUN_FORMAT, check_run_format
-from giril_rl.runs.naming import NO_EFFECT, without_added
+from giril_rl.runs.naming import NO_EFFECT, RETIRED, without_added
 from giril_rl.files.places import cannot_write, check_place
 from giril_rl.config.leaves import flat
 from giril_rl.runs.sources import sources_of
@@ -319,7 +319,8 @@ def _differences(
     before: Mapping[str, Any], now: Mapping[str, Any], ignore: Collection[str]
 ) -> list[str]:
     """``"ppo.lr: 0.1 there, 0.2 now"`` for each dotted key whose values differ."""
-    old, new = (flat(without_added(config), keep_empty=True) for config in (before, now))
+    retired = {key: before[key] for key in RETIRED if key in before and key not in now}
+    old, new = (flat(without_added(config), keep_empty=True) for config in (before, {**retired, **now}))
     return [
         f"{key}: {old.get(key, 'nothing')!s} there, {new.get(key, 'nothing')!s} now"
         for key in [*new, *(key for key in old if key not in new)]
