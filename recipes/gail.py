@@ -23,7 +23,7 @@ from giril_rl.training import (
     obtain_demonstration,
     open_run,
     return_scaling,
-    train,
+    train_policy,
 )
 from giril_rl.transforms import IntrinsicReward
 
@@ -55,5 +55,5 @@ def main(cfg: Config, out: Path) -> None:
         )
         agent = make_agent(env, cfg.ppo, cfg.seed).to(cfg.device)
         ppo = PPO(agent, cfg.ppo, steps=cfg.steps, termination=cfg.termination)
-        trained = train(env, ppo, transform, seed=cfg.seed, run=run, reward_trainer=trainer)
+        trained = train_policy(env, ppo, transform, seed=cfg.seed, run=run, reward_trainer=trainer)
         finish_run(run, cfg, agent, trained, expert=expert, demo=demo, reward=reward)

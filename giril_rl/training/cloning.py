@@ -23,6 +23,9 @@ from giril_rl.runs.run import Run
 from giril_rl.training.fitting import run_fit
 from giril_rl.training.loop import Trained
 
+CHECKPOINT_EVERY = 1_000
+"""Gradient steps between checkpoints."""
+
 register(Method("bc", "BC", ORANGE, settings=BCConfig, rank=4))
 
 
@@ -82,7 +85,7 @@ def clone_behaviour(
         cloning,
         steps=cfg.steps,
         log_every=cfg.log_every,
-        checkpoint_every=1_000,
+        checkpoint_every=CHECKPOINT_EVERY,
         run=run,
         phase=phase,
         name="behaviour cloning",

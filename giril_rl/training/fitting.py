@@ -19,6 +19,9 @@ from giril_rl.runs.randomness import restore_rng, rng_state, seeded, stream_seed
 from giril_rl.runs.restoring import restoring
 from giril_rl.runs.run import Run
 
+CHECKPOINT_EVERY = 5_000
+"""Gradient steps of a reward model between checkpoints."""
+
 
 class Fit(Protocol):
     """What :func:`run_fit` drives: a model, its optimizer and its data."""
@@ -137,7 +140,7 @@ def fit_reward(
         fit,
         steps=cfg.steps,
         log_every=cfg.log_every,
-        checkpoint_every=5_000,
+        checkpoint_every=CHECKPOINT_EVERY,
         run=run,
         phase=phase,
         name="the reward model's fit",

@@ -52,7 +52,7 @@ class Trained:
     stopped: bool = False
 
 
-def train(
+def train_policy(
     env: BatchedEnv,
     algorithm: Algorithm,
     transform: nn.Module,
@@ -253,18 +253,23 @@ class _Session:
         return exact
 
     def forget_episodes(self) -> None:
-        """Clears the sums over running episodes, whose rest is lost, and warns."""
+        """Warns that running episodes are lost, and clears the sums over them."""
         warnings.warn(
             "the simulator did not come back to where it was saved (it does not repeat itself, or "
             f"is another version): this run continues at {self.trained.steps:,} steps with fresh "
             "episodes, which result.json counts in inexact_resumes.",
             stacklevel=3,
         )
-        self.tracker.running_return.zero_()
-        self.tracker.running_length.zero_()
-        for part in self.transform.modules():
-            if isinstance(part, ReturnScaling) and part.reset_rule == "done":
-                part.running_return.zero_()
+        forget_episodes(self.tracker, self.transform)
+
+
+def forget_episodes(tracker: EpisodeTracker, transform: nn.Module) -> None:
+    """Clears the sums over running episodes, whose rest is lost."""
+    tracker.running_return.zero_()
+    tracker.running_length.zero_()
+    for part in transform.modules():
+        if isinstance(part, ReturnScaling) and part.reset_rule == "done":
+            part.running_return.zero_()
 
 
 def _collector(env: BatchedEnv, algorithm: Algorithm, total_frames: int) -> Collector:

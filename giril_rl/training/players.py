@@ -23,7 +23,7 @@ from giril_rl.runs.finished import read_result
 from giril_rl.runs.naming import out_folder
 from giril_rl.runs.randomness import check_device
 from giril_rl.runs.run import Run
-from giril_rl.training.loop import train
+from giril_rl.training.loop import train_policy
 from giril_rl.training.ppo import PPO, return_scaling
 from giril_rl.training.result import finish_run
 
@@ -61,7 +61,7 @@ def train_expert(cfg: ExpertRunConfig, folder: Path, *, recipe: str = "expert") 
             return read_result(folder)
         env = run.closing(make_env(cfg.task, cfg.ppo.num_envs, cfg.seed, use="player"))
         agent = make_agent(env, cfg.ppo, cfg.seed, use="player").to(cfg.device)
-        trained = train(
+        trained = train_policy(
             env,
             PPO(agent, cfg.ppo, steps=cfg.steps),
             _transform(cfg),
