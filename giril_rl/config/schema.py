@@ -353,14 +353,6 @@ class RunConfig:
     """What all recipes share."""
 
     task: TaskConfig = field(default_factory=TaskConfig)
-    profile: str = knob(
-        "released",
-        "released (reward averaged over environments) or paper (eq. 2)",
-        choices=("released", "paper"),
-    )
-    batch_mean: bool = knob(
-        True, "average each step's reward over the environments (profile released)"
-    )
     seed: int = knob(0, "seed of the policy's training", low=0)
     steps: int = knob(MISSING, "policy environment steps", low=1)
     out: str | None = knob(
@@ -383,29 +375,12 @@ class RunConfig:
         "where networks and batches are; environments stay on the CPU",
         choices=("cpu", "cuda"),
     )
-    termination: str = knob(
-        "ends",
-        "ends: nothing comes after a failure; bootstrap: its value continues as after a time limit",
-        choices=("ends", "bootstrap"),
-    )
     ppo: PPOConfig = field(default_factory=PPOConfig)
     eval: EvalConfig = field(default_factory=EvalConfig)
 
 
 @dataclass
-class UnaveragedRunConfig(RunConfig):
-    """What recipes share that never average a reward: both profiles give the same run."""
-
-    profile: str = knob(
-        "released",
-        "no effect here: nothing is averaged, both profiles are the same run",
-        choices=("released", "paper"),
-    )
-    batch_mean: bool = knob(True, "no effect here")
-
-
-@dataclass
-class ExpertRunConfig(UnaveragedRunConfig):
+class ExpertRunConfig(RunConfig):
     """What the expert's own recipe takes: PPO on the true reward."""
 
     steps: int = knob(5_000_000, "most environment steps of expert training (paper: 5M)", low=1)
@@ -415,7 +390,61 @@ class ExpertRunConfig(UnaveragedRunConfig):
 
 
 @dataclass
-class ControlRunConfig(RunConfig):
+class DemoRunConfig(RunConfig):
+    """What recipes share that learn from a demonstration."""
+
+    expert: ExpertConfig = field(default_factory=ExpertConfig)
+    demo: DemoConfig = field(default_factory=DemoConfig)
+
+    @property
+    def needs_demonstration(self) -> bool:
+        """Whether the run learns from a demonstration, and so from an expert."""
+        return True
+
+
+@dataclass
+class RewardRunConfig(DemoRunConfig):
+    """What recipes share that train a policy on a reward of the demonstration."""
+
+    scaling: ScalingConfig = field(default_factory=ScalingConfig)
+    termination: str = knob(
+        "ends",
+        "ends: nothing comes after a failure; bootstrap: its value continues as after a time limit",
+        choices=("ends", "bootstrap"),
+    )
+
+    @property
+    def reward_seed(self) -> int:
+        """Seed of the reward model: ``reward.seed``, or the run's."""
+        own = getattr(getattr(self, "reward", None), "seed", None)
+        return self.seed if own is None else own
+
+
+@dataclass
+class AveragedRunConfig(RewardRunConfig):
+    """What recipes share whose reward may be averaged over the environments."""
+
+    profile: str = knob(
+        "released",
+        "released (reward averaged over environments) or paper (eq. 2)",
+        choices=("released", "paper"),
+    )
+    batch_mean: bool = knob(
+        True, "average each step's reward over the environments (profile released)"
+    )
+
+
+@dataclass
+class UnaveragedRunConfig(RunConfig):
+    """Deprecated, for recipes that were copied from version 0.1: take :class:`RunConfig`."""
+
+    profile: str = knob("released", "no effect", choices=("released", "paper"))
+    batch_mean: bool = knob(True, "no effect")
+    termination: str = knob("ends", "no effect here", choices=("ends", "bootstrap"))
+
+
+@dataclass
+class ControlRunConfig(AveragedRunConfig):
     """What the controls' recipe takes; what the chosen reward has no use for is not read."""
 
     reward: str = knob(
@@ -435,12 +464,9 @@ class ControlRunConfig(RunConfig):
         ),
     )
     held_episodes: int = knob(20, "held_action: episodes that choose the action", low=1)
-    expert: ExpertConfig = field(default_factory=ExpertConfig)
-    demo: DemoConfig = field(default_factory=DemoConfig)
     giril: GenerativeConfig = field(default_factory=GenerativeConfig)
     icm: CuriosityConfig = field(default_factory=CuriosityConfig)
     fit: FitConfig = field(default_factory=FitConfig)
-    scaling: ScalingConfig = field(default_factory=ScalingConfig)
 
     @property
     def needs_demonstration(self) -> bool:

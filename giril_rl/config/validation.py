@@ -72,14 +72,11 @@ def _check_task(key: str, task: TaskConfig) -> None:
 
 
 def _check_expert_run(config: ExpertRunConfig) -> None:
-    for key, value, only in (
-        ("task.horizon", config.task.horizon, "own"),
-        ("termination", config.termination, "ends"),
-    ):
-        if value != only:
-            raise UserError(
-                f"{key}={value}: an expert plays the task as it is; leave {key}={only}."
-            )
+    if config.task.horizon != "own":
+        raise UserError(
+            f"task.horizon={config.task.horizon}: an expert plays the task as it is; leave "
+            "task.horizon=own."
+        )
 
 
 def _check_cloning(config: Any, cloning: BCConfig) -> None:

@@ -34,7 +34,7 @@ class FixedHorizonEnv(GymVectorEnv):
 
     - ``following_observation``, the state from which the simulator really goes on. It equals
       ``observation`` but at a hidden reset, where it is the reset observation. A learner's
-      bootstrapped value must be that of this state; :class:`giril_rl.training.PPOLearner` uses it.
+      bootstrapped value must be that of this state; :class:`giril_rl.training.PPO` uses it.
     - ``scored``, whether the step belongs to an episode of the task itself: True up to and with
       the first failure since the horizon began. The sum of these rewards is the task's own score.
 

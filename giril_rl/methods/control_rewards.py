@@ -18,8 +18,46 @@ from giril_rl.rewards import (
 )
 from giril_rl.runs.metrics import METRICS, read_metrics
 from giril_rl.runs.run import Run
-from giril_rl.training.fit import fit_reward
+from giril_rl.training import (
+    HeldAction,
+    RandomPolicy,
+    check_discrete,
+    fit_reward,
+    held_action_scores,
+)
 from giril_rl.transforms.intrinsic import device_of
+
+
+def check_baseline(cfg: ControlRunConfig) -> None:
+    """Refuses a policy that the task's actions do not allow, before any long work.
+
+    Raises:
+        UserError: for ``held_action`` without discrete actions, ``random`` without bounds.
+    """
+    if cfg.reward == "held_action":
+        check_discrete(cfg.task)
+    elif cfg.reward == "random":
+        RandomPolicy.of_task(cfg.task, cfg.seed)
+
+
+def baseline_policy(cfg: ControlRunConfig, run: Run) -> RandomPolicy | HeldAction | None:
+    """The policy that is scored as it is; None where the control is a reward to learn from.
+
+    The held action is chosen in episodes of the training's seed and scored in the evaluation's.
+
+    Args:
+        cfg: the run's settings.
+        run: where the scores of all actions are logged.
+    """
+    if cfg.reward == "random":
+        return RandomPolicy.of_task(cfg.task, cfg.seed)
+    if cfg.reward != "held_action":
+        return None
+    scores = held_action_scores(cfg.task, episodes=cfg.held_episodes, seed=cfg.seed)
+    run.truncate_metrics("held_action", -1)
+    for action, score in enumerate(scores):
+        run.log(action, {"held_action/return_mean": score}, phase="held_action")
+    return HeldAction.of_task(cfg.task, scores.index(max(scores)))
 
 
 def control_reward(
@@ -55,7 +93,7 @@ def control_reward(
         cfg.fit,
         seed=seed,
         run=run,
-        held_out=holdout(demo, cfg.demo.subsample),
+        validation=holdout(demo, cfg.demo.subsample),
     )
     if cfg.reward == "negated_giril":
         return AffineReward(reward, scale=-1.0), seeds

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import torch
 from torch import Tensor
 
@@ -82,6 +84,14 @@ class BottleneckLoss(DiscriminatorLoss):
     def update_beta(self, kl: Tensor) -> None:
         """The dual step, in place, for the mean KL that :meth:`forward` returned."""
         self.beta.copy_(dual_step(self.beta, kl, self.information, self.beta_step))
+
+    def after_step(self, log: Mapping[str, Tensor]) -> None:
+        """The dual step on beta."""
+        self.update_beta(log["kl"])
+
+    def logged_state(self) -> dict[str, float]:
+        """Beta."""
+        return {"beta": self.beta.item()}
 
     def _judge(
         self, observation: Tensor, code: Tensor, experts: int

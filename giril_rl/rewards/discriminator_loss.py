@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
@@ -114,6 +115,13 @@ class DiscriminatorLoss(LossModule):
     def log_keys(self) -> list[str]:
         """Names of what is logged."""
         return ["accuracy_expert", "accuracy_policy"]
+
+    def after_step(self, log: Mapping[str, Tensor]) -> None:
+        """Follows each gradient step; ``log`` has the step's :attr:`log_keys`."""
+
+    def logged_state(self) -> dict[str, float]:
+        """Numbers of the loss's own that are worth logging."""
+        return {}
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -97,6 +97,7 @@ def print_scores(folder: Path) -> None:
 
 
 def print_both(scores: dict[str, Any]) -> None:
+    """Prints the scores of the sampled and of the deterministic policy."""
     print(describe("sampled", scores))
     if scores.get("deterministic") is not None:  # Runs of an early version have none.
         print(describe("deterministic", scores["deterministic"]))

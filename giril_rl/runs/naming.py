@@ -45,6 +45,9 @@ ADDED = {
     "held_episodes": 20,
 }
 """Keys that earlier runs did not have, with the value that they behaved by."""
+RETIRED = {"profile": "released", "batch_mean": True}
+"""Keys that every recipe once had, also where they had no effect. All hashes go on counting them,
+so that earlier runs are known."""
 
 
 def without_added(
@@ -91,7 +94,7 @@ def config_hash(config: Any) -> str:
         >>> config_hash(RunConfig(seed=1)) == config_hash(RunConfig(seed=1, root="elsewhere"))
         True
     """
-    values = without_added(asdict(config), drop=NO_EFFECT)
+    values = without_added({**RETIRED, **asdict(config)}, drop=NO_EFFECT)
     text = json.dumps([EDITION, values], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:12]
 

@@ -14,9 +14,9 @@ from contextvars import ContextVar
 from pathlib import Path
 from typing import Any
 
+from giril_rl.config.recipe_files import Recipe
 from giril_rl.errors import UserError
 from giril_rl.files.disk import read_json
-from giril_rl.config.recipe_files import Recipe
 
 _making: ContextVar[tuple[Path, dict[str, str]] | None] = ContextVar("making", default=None)
 

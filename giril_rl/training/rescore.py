@@ -23,9 +23,8 @@ from giril_rl.runs.finished import (
     read_result,
     read_settings,
 )
-from giril_rl.training.evaluate import Player, evaluate_both
-from giril_rl.training.held_action import HELD_ACTION, HeldAction
-from giril_rl.training.random_policy import RANDOM, RandomPolicy
+from giril_rl.training.baselines import HELD_ACTION, RANDOM, HeldAction, RandomPolicy
+from giril_rl.training.scoring import Player, evaluate_both
 
 
 def evaluate_run(folder: Path, episodes: int | None = None, seed: int | None = None) -> None:

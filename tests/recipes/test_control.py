@@ -183,8 +183,8 @@ def test_negated_and_centred_are_made_of_the_recipe_s_own_reward(root, tmp_path)
     for reward in ("negated_giril", "centred_giril", "noise"):
         run("control", tmp_path / reward, root, *plain, f"reward={reward}")
         fits = [load_state(tmp_path / name / "fit.safetensors") for name in ("giril", reward)]
-        for name, value in fits[0]["loss"].items():
-            assert value.equal(fits[1]["loss"][name]), name
+        for name, value in fits[0]["fit"]["loss"].items():
+            assert value.equal(fits[1]["fit"]["loss"][name]), name
     paid = first_batch(tmp_path / "giril")
     assert first_batch(tmp_path / "negated_giril") == pytest.approx(-paid, rel=1e-5)
     rows = read_metrics(tmp_path / "centred_giril" / "metrics.jsonl")

@@ -17,7 +17,8 @@ from giril_rl.rewards import GenerativeReward
 from giril_rl.runs.finished import read_config, read_part, read_settings
 from giril_rl.runs.naming import config_hash
 from giril_rl.training import make_agent
-from giril_rl.training.expert import demonstration_place, expert_settings
+from giril_rl.training.demonstrations import demonstration_place
+from giril_rl.training.players import expert_settings
 
 WORDS = ("task=breakout", "task.max_episode_steps=20")
 

@@ -13,7 +13,7 @@ from giril_rl.policies.agent import load_agent, make_agent
 from giril_rl.policies.agents import agent_for, check_actions, fits
 from giril_rl.policies.pixel_policy import PixelActorCritic
 from giril_rl.policies.policy import ActorCritic
-from giril_rl.training.evaluate import evaluate
+from giril_rl.training.scoring import evaluate
 
 CARTPOLE = TaskConfig(name="cartpole", env_id="CartPole-v1")
 CFG = PPOConfig(hidden=[16])

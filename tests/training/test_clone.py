@@ -14,8 +14,8 @@ from giril_rl.policies.policy import NORMALISED, ActorCritic
 from giril_rl.runs.interrupt import Interrupted
 from giril_rl.runs.metrics import read_metrics
 from giril_rl.runs.run import Run
-from giril_rl.training import clone
-from giril_rl.training.clone import clone_behaviour
+from giril_rl.training import cloning
+from giril_rl.training.cloning import clone_behaviour
 
 BOX, DISCRETE = Bounded(-1, 1, shape=(1, 2)), Categorical(3, shape=(1,))
 GAIN = torch.tensor([[0.3, -0.2], [0.1, 0.4], [0.0, 0.2]])
@@ -49,7 +49,7 @@ def cloned(folder, fitted=None, held_out=None, *, agent=None, seed=0, spec=BOX, 
     fitted = pairs(40, spec=spec) if fitted is None else fitted
     with Run.open(folder, {}, recipe="x") as run:
         cfg = BCConfig(**settings)
-        trained = clone_behaviour(agent, fitted, cfg, seed=seed, run=run, held_out=held_out)
+        trained = clone_behaviour(agent, fitted, cfg, seed=seed, run=run, validation=held_out)
     assert trained.steps == 0 and trained.seconds > 0
     return agent, read_metrics(folder / "metrics.jsonl")
 
@@ -158,7 +158,7 @@ def test_one_step_by_hand(tmp_path):
 def test_the_step_size_decreases_to_zero(tmp_path):
     cloned(tmp_path, stop="fixed", steps=50, lr=0.5)
     state = load_state(tmp_path / "bc.safetensors")
-    assert state["optimizer"]["param_groups"][0]["lr"] == pytest.approx(0.5 / 50)
+    assert state["fit"]["optimizer"]["param_groups"][0]["lr"] == pytest.approx(0.5 / 50)
 
 
 # Normalisation and deviation
@@ -272,7 +272,7 @@ class Killed(Exception):
 def test_a_cloning_stopped_again_and_again_ends_bit_for_bit_as_an_undisturbed_one(
     stop, tmp_path, monkeypatch
 ):
-    monkeypatch.setattr(clone, "CHECKPOINT_EVERY", 20)
+    monkeypatch.setattr(cloning, "CHECKPOINT_EVERY", 20)
     settings = {"stop": stop, "batch": 4, "steps": 60, "weight_decay": 0.1}
     whole, rows = noisy(tmp_path / "whole", **settings)
     log = Run.log

@@ -16,7 +16,7 @@ from giril_rl.rewards import (
 from giril_rl.runs.interrupt import Interrupted
 from giril_rl.runs.metrics import read_metrics
 from giril_rl.runs.run import Run
-from giril_rl.training import fit
+from giril_rl.training import fitting
 
 SPECS = {"box": Bounded(-1, 1, shape=(1, 1)), "discrete": Categorical(3, shape=(1,))}
 TERMS = ("reconstruction", "kl", "action")
@@ -45,7 +45,7 @@ def fitted(folder, *, kind="box", data=None, held_out=None, seed=0, model_seed=0
     data = transitions(100, kind=kind) if data is None else data
     loss = GenerativeRewardLoss(reward)
     with Run.open(folder, {}, recipe="x") as run:
-        fit.fit_reward(loss, data, cfg, seed=seed, run=run, held_out=held_out)
+        fitting.fit_reward(loss, data, cfg, seed=seed, run=run, validation=held_out)
     return dict(loss.named_parameters()), read_metrics(folder / "metrics.jsonl")
 
 
@@ -123,7 +123,7 @@ class Killed(Exception):
 def test_a_fit_stopped_again_and_again_ends_bit_for_bit_as_an_undisturbed_one(
     log_every, tmp_path, monkeypatch
 ):
-    monkeypatch.setattr(fit, "CHECKPOINT_EVERY", 20)
+    monkeypatch.setattr(fitting, "CHECKPOINT_EVERY", 20)
     held_out = transitions(20, seed=5)
     weights, rows = fitted(tmp_path / "whole", held_out=held_out, log_every=log_every)
     log = Run.log
@@ -183,7 +183,7 @@ def fit_frames(folder, *, loss=None, held_out=None, **kwargs):
     cfg = FitConfig(**{"steps": 6, "batch": 4, "lr": 1e-3, "log_every": 2, **kwargs})
     loss = pixel_loss() if loss is None else loss
     with Run.open(folder, {}, recipe="x") as run:
-        fit.fit_reward(loss, frames(8), cfg, seed=0, run=run, held_out=held_out)
+        fitting.fit_reward(loss, frames(8), cfg, seed=0, run=run, validation=held_out)
     return dict(loss.state_dict()), read_metrics(folder / "metrics.jsonl")
 
 
@@ -222,7 +222,7 @@ def test_the_logged_loss_of_frames_is_that_of_eval_mode(tmp_path):
 
 @pytest.mark.parametrize("compile", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_a_fit_of_frames_is_resumed_bit_for_bit_with_its_statistics(compile, tmp_path, monkeypatch):
-    monkeypatch.setattr(fit, "CHECKPOINT_EVERY", 4)
+    monkeypatch.setattr(fitting, "CHECKPOINT_EVERY", 4)
     expected, expected_rows = fit_frames(tmp_path / "whole", compile=compile)
     log = Run.log
     for step, how in ((2, Interrupted), (6, Killed)):

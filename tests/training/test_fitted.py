@@ -18,7 +18,7 @@ from giril_rl.demos import Demonstration, shipped_demonstrations
 from giril_rl.errors import UserError
 from giril_rl.runs.naming import config_hash
 from giril_rl.training import expert, fitted
-from giril_rl.training.fitted import find_demonstration
+from giril_rl.training.demonstrations import find_demonstration
 
 pytest.importorskip("ale_py")
 KEY = ("next", "intrinsic_reward")

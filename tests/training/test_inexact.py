@@ -13,9 +13,9 @@ from giril_rl.envs import GymVectorEnv
 from giril_rl.files.checkpoint import load_state
 from giril_rl.runs.metrics import read_metrics
 from giril_rl.runs.result_file import read_result_file
-from giril_rl.training import RandomPolicy, Run, Trained, finish_run, make_agent, train_ppo
+from giril_rl.training import PPO, RandomPolicy, Run, Trained, finish_run, make_agent
 from giril_rl.training.episodes import EpisodeTracker
-from giril_rl.training.ppo import forget_episodes
+from giril_rl.training.loop import forget_episodes
 from giril_rl.transforms import ReturnScaling
 
 BATCH = 4 * 32
@@ -55,8 +55,8 @@ def train(step_counter, folder, monkeypatch, *, stop=None, saves=False):
     with monkeypatch.context() as patch, Run.open(folder, {}, recipe="x") as run:
         patch.setattr(Run, "log", log_or_stop)
         patch.setattr(Run, "save", save_or_stop)
-        return train_ppo(
-            env, make_agent(env, CFG, 0), nn.Identity(), CFG, steps=6 * BATCH, seed=0, run=run
+        return train(
+            env, PPO(make_agent(env, CFG, 0), CFG, steps=6 * BATCH), nn.Identity(), seed=0, run=run
         )
 
 
@@ -102,7 +102,7 @@ def test_the_sums_of_lost_episodes_are_forgotten():
         scaling.running_return = torch.tensor([2.0, 3.0], dtype=torch.float64)
     tracker.running_return.fill_(5.0)
     tracker.running_length.fill_(7)
-    forget_episodes(nn.ModuleDict({"tracker": tracker, "relabel": Compose(done, never)}))
+    forget_episodes(tracker, Compose(done, never))
     assert not tracker.running_return.any() and not tracker.running_length.any()
     assert done.running_return.tolist() == [0.0, 0.0]
     assert never.running_return.tolist() == [2.0, 3.0]  # It knows of no episodes.
@@ -112,5 +112,5 @@ def test_result_json_says_it(tmp_path):
     task = TaskConfig(name="cartpole", env_id="CartPole-v1")
     cfg = RunConfig(task=task, eval=EvalConfig(episodes=1))
     with Run.open(tmp_path, {}, recipe="x") as run:
-        finish_run(run, cfg, RandomPolicy.of_task(task), Trained(0, 1.0, 3), method="x")
+        finish_run(run, cfg, RandomPolicy.of_task(task), Trained(0, 1.0, 3))
     assert read_result_file(tmp_path / "result.json")["inexact_resumes"] == 3

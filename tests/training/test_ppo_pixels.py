@@ -18,7 +18,8 @@ from giril_rl.rewards import GenerativeReward
 from giril_rl.runs.interrupt import Interrupted
 from giril_rl.runs.metrics import read_metrics
 from giril_rl.runs.run import Run
-from giril_rl.training.ppo import PPOLearner, train_ppo
+from giril_rl.training.loop import train_policy
+from giril_rl.training.ppo import PPO
 from giril_rl.transforms import BatchMeanReward, IntrinsicReward, ReturnScaling
 
 GAMMA, LMBDA = 0.9, 0.8
@@ -91,7 +92,7 @@ def test_advantages_are_those_of_an_ordinary_value_network(agent, termination):
     data = collected(agent)
     expected = {x: ordinary(agent, data, bootstrap=x == "bootstrap") for x in ("ends", "bootstrap")}
     cfg = config(gamma=GAMMA, lmbda=LMBDA, minibatch=18)
-    PPOLearner(agent, cfg, total_steps=1, termination=termination).learn(data, 0)
+    PPO(agent, cfg, steps=1, termination=termination).update(data)
     same = expected[termination]
     torch.testing.assert_close(data["value_target"], same["value_target"], rtol=1e-4, atol=1e-4)
     advantage = same["advantage"]
@@ -128,7 +129,7 @@ def test_the_value_loss_is_clipped_where_asked(agent, clip_value):
         agent.critic.bias.add_(0.7)  # As if earlier minibatches had moved the value.
         value = agent.critic(agent.hidden(data["observation"]))
     cfg = config(clip_value=clip_value, clip=0.1, minibatch=18)
-    losses = PPOLearner(agent, cfg, total_steps=1).learn(data, 0)
+    losses = PPO(agent, cfg, steps=1).update(data)
     target = data["value_target"]
     squared = (value - target) ** 2
     clipped = torch.maximum(squared, (old + 0.1 - target) ** 2)
@@ -162,12 +163,12 @@ def train(folder, *, steps=4 * BATCH, env=AtariEnv, relabel=learned_reward, seed
     env = env("breakout", 2, **kwargs)
     agent, cfg = make_agent(env, config(), seed=0), config()
     with Run.open(folder, {}, recipe="x") as run:
-        train_ppo(env, agent, relabel(env), cfg, steps=steps, seed=seed, run=run)
+        train_policy(env, PPO(agent, cfg, steps=steps), relabel(env), seed=seed, run=run)
         state = run.load("ppo")
     env.close()
     state.pop("seconds")
     for name, value in agent.state_dict().items():
-        assert torch.equal(value, state["parts"][f"agent.{name}"])
+        assert torch.equal(value, state["algorithm"]["agent"][name])
     return state
 
 
@@ -181,7 +182,7 @@ def same(one, other):
 
 
 def policy(state):
-    return {key: value for key, value in state["parts"].items() if key.startswith("agent.")}
+    return state["algorithm"]["agent"]
 
 
 class Killed(Exception):

@@ -95,7 +95,8 @@ def checkpoint(change):
 
 
 def without_weights(state):
-    state["parts"] = {key: value[:1] for key, value in state["parts"].items() if value.ndim}
+    agent = state["algorithm"]["agent"]
+    state["algorithm"]["agent"] = {key: value[:1] for key, value in agent.items() if value.ndim}
     return state
 
 

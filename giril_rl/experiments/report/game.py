@@ -13,7 +13,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type, step_mdp
 from giril_rl.config.schema import TaskConfig
 from giril_rl.envs import AtariEnv, make_env
 from giril_rl.runs.randomness import seeded
-from giril_rl.training.evaluate import Player
+from giril_rl.training.scoring import Player
 
 MOST_STEPS = 2_000
 GAMES = 5

@@ -21,7 +21,7 @@ from giril_rl.rewards import GenerativeReward
 from giril_rl.runs.finished import read_config, read_part, read_settings
 from giril_rl.runs.naming import safe
 from giril_rl.runs.pretrained import CARD
-from giril_rl.training.fitted import find_demonstration
+from giril_rl.training.demonstrations import find_demonstration
 from giril_rl.training.result import REWARD
 
 UNTRAINED = "control:untrained_giril"

@@ -29,7 +29,7 @@ from giril_rl.experiments.report.style import (
     method_name,
     rank,
 )
-from giril_rl.training.random_policy import RANDOM
+from giril_rl.training.baselines import RANDOM
 
 
 @dataclass

@@ -1,8 +1,8 @@
-"""Training a discriminator beside the policy: a few steps with every batch of PPO."""
+"""Training a reward model beside the policy, a few steps with each of its batches."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Protocol
 
 import torch
 from tensordict import TensorDictBase
@@ -10,18 +10,49 @@ from torch import Tensor
 
 from giril_rl.config.schema import AdversarialConfig
 from giril_rl.graphs.traced import TracedGradients
-from giril_rl.rewards.bottleneck_loss import BottleneckLoss
 from giril_rl.rewards.discriminator_loss import DiscriminatorLoss
 from giril_rl.runs.randomness import restore_rng, rng_state, seeded, stream_seed
 
 
-class AdversarialLearner:
-    """The :class:`~giril_rl.training.ppo.RewardLearner` of GAIL and VAIL.
+class RewardTrainer(Protocol):
+    """Trains a reward model on each batch that the policy collects, before it is relabelled.
+
+    Examples:
+        >>> class Count:
+        ...     batches = 0
+        ...     def update(self, batch):
+        ...         self.batches += 1
+        ...         return {"reward_model/batches": float(self.batches)}
+        ...     def state_dict(self):
+        ...         return {"batches": self.batches}
+        ...     def load_state_dict(self, state):
+        ...         self.batches = state["batches"]
+        >>> trainer: RewardTrainer = Count()
+    """
+
+    def update(self, batch: TensorDictBase) -> dict[str, float]:
+        """Learns from a batch ``(num_envs, time)`` and returns what is to be logged.
+
+        It reads observation, action and next observation, never a reward, and writes nothing.
+        """
+        ...
+
+    def state_dict(self) -> dict[str, Any]:
+        """All that later updates depend on, of the kinds that a checkpoint can hold."""
+        ...
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restores what :meth:`state_dict` gave."""
+        ...
+
+
+class AdversarialTrainer:
+    """Trains the discriminator of GAIL and VAIL.
 
     Args:
-        loss: the discriminator's loss, of which it trains the reward module in place.
+        loss: the discriminator's loss; its reward module is trained in place.
         expert: the expert's pairs, a flat batch with the reward's ``in_keys``.
-        cfg: step size, number of steps with each batch, and their size.
+        cfg: step size, gradient steps with each batch, and minibatch size.
         seed: seeds minibatches and the loss's noise; the global random state is left alone.
 
     Examples:
@@ -34,10 +65,10 @@ class AdversarialLearner:
         >>> pairs = lambda *n: TensorDict(
         ...     {"observation": torch.randn(*n, 2), "action": torch.zeros(*n, 1)}, n
         ... )
-        >>> learner = AdversarialLearner(
+        >>> trainer = AdversarialTrainer(
         ...     DiscriminatorLoss(reward), pairs(50), AdversarialConfig(), seed=0
         ... )
-        >>> metrics = learner.update(pairs(4, 100))  # 4 environments, 100 steps
+        >>> metrics = trainer.update(pairs(4, 100))  # 4 environments, 100 steps
         >>> sorted(metrics)[:2]
         ['discriminator/accuracy_expert', 'discriminator/accuracy_policy']
     """
@@ -63,7 +94,7 @@ class AdversarialLearner:
         """Trains the discriminator on a batch ``(num_envs, time)`` of which it reads the pairs.
 
         Returns:
-            Means over the steps of all losses and of what the loss logs, and VAIL's beta.
+            Means over the steps of all losses and of what the loss logs, and its state.
         """
         dims = batch.ndim
         policy = [batch.get(key).flatten(0, dims - 1) for key in self._pair_keys]
@@ -76,8 +107,8 @@ class AdversarialLearner:
             f"discriminator/{name}": torch.stack([log[name] for log in logs]).mean().item()
             for name in logs[0]
         }
-        if isinstance(self.loss, BottleneckLoss):
-            metrics["discriminator/beta"] = self.loss.beta.item()
+        for name, value in self.loss.logged_state().items():
+            metrics[f"discriminator/{name}"] = value
         return metrics
 
     def _step(self, policy: list[Tensor]) -> dict[str, Tensor]:
@@ -85,8 +116,7 @@ class AdversarialLearner:
             [*_drawn(self._expert, self.cfg.batch), *_drawn(policy, self.cfg.batch)]
         )
         self.optimizer.step()
-        if isinstance(self.loss, BottleneckLoss):
-            self.loss.update_beta(log["kl"])
+        self.loss.after_step(log)
         return log
 
     def state_dict(self) -> dict[str, Any]:
