@@ -221,7 +221,7 @@ def train(folder, *, method="gail", kind="discrete", garbage=None, steps=4 * BAT
     learner, reward = make(method, spec=env.action_spec, expert=expert, dim=dim, penalty=1.0)
     relabel = Compose(IntrinsicReward(reward), ReturnScaling(0.99))
     with Run.open(folder, {}, recipe="x") as run:
-        train(
+        train_policy(
             env,
             PPO(agent, CFG, steps=steps),
             relabel,

@@ -55,7 +55,7 @@ def train(step_counter, folder, monkeypatch, *, stop=None, saves=False):
     with monkeypatch.context() as patch, Run.open(folder, {}, recipe="x") as run:
         patch.setattr(Run, "log", log_or_stop)
         patch.setattr(Run, "save", save_or_stop)
-        return train(
+        return train_policy(
             env, PPO(make_agent(env, CFG, 0), CFG, steps=6 * BATCH), nn.Identity(), seed=0, run=run
         )
 

@@ -473,7 +473,7 @@ def test_training_stops_at_a_score(tmp_path, step_counter):
         cfg = config(num_envs=2, rollout=32, checkpoint_every=10_000)
         agent = make_agent(env, cfg, seed=0)
         with Run.open(tmp_path / folder, {}, recipe="x") as run:
-            steps = train(
+            steps = train_policy(
                 env, PPO(agent, cfg, steps=4 * 64), Compose(), seed=0, run=run, stop_at=stop_at
             ).steps
             assert run.load("ppo")["steps"] == steps

@@ -115,7 +115,7 @@ def train(folder, **task):
 
     relabel = Compose(ReturnScaling(0.99))
     with Run.open(folder, {}, recipe="x") as run:
-        train(
+        train_policy(
             env,
             PPO(agent, cfg, steps=4 * BATCH, termination=termination),
             nn.Sequential(Constant(), relabel),
@@ -177,4 +177,4 @@ def test_a_score_is_of_the_tasks_own_episodes():
 @pytest.mark.parametrize("recipe", shipped(), ids=lambda recipe: recipe.name)
 def test_every_recipe_that_trains_a_policy_passes_the_choice_on(recipe):
     text = recipe.path.read_text()
-    assert text.count("termination=cfg.termination") == text.count("= train_ppo(")
+    assert text.count("termination=cfg.termination") == text.count("ppo = PPO(")
