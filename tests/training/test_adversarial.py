@@ -23,6 +23,7 @@ from giril_rl.rewards import (
 from giril_rl.runs.interrupt import Interrupted
 from giril_rl.runs.metrics import read_metrics
 from giril_rl.runs.run import Run
+from giril_rl.training.loop import train_policy
 from giril_rl.training.ppo import PPO
 from giril_rl.training.reward_trainers import AdversarialTrainer
 from giril_rl.transforms import IntrinsicReward, ReturnScaling

@@ -15,6 +15,7 @@ from giril_rl.policies.agent import make_agent
 from giril_rl.policies.policy import ActorCritic
 from giril_rl.runs.metrics import read_metrics
 from giril_rl.runs.run import Run
+from giril_rl.training.loop import train_policy
 from giril_rl.training.ppo import PPO
 from giril_rl.training.scoring import evaluate
 from giril_rl.transforms import ReturnScaling
