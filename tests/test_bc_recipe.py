@@ -10,7 +10,7 @@ from giril_rl.config.compose import resolved
 from giril_rl.config.recipe_config import config_class
 from giril_rl.config.recipe_files import find
 from giril_rl.errors import UserError
-from giril_rl.files.checkpoint import load_state
+from giril_rl.runs.checkpoint import load_state
 from giril_rl.runs.metrics import read_metrics
 
 TINY = [

@@ -16,7 +16,7 @@ RECIPE = '''"""Fake: a run without work."""
 from dataclasses import asdict, dataclass
 
 from giril_rl.config.schema import RunConfig, knob
-from giril_rl.runs.naming import config_hash
+from giril_rl.runs.identity import config_hash
 from giril_rl.training import Run
 
 SCORES = ("return_mean", "return_std", "return_median", "episode_length_mean")

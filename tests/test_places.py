@@ -3,7 +3,7 @@ from pathlib import Path
 import pytest
 
 from giril_rl.errors import UserError
-from giril_rl.files.places import check_place
+from giril_rl.files.disk import check_place
 
 
 def test_a_drive_that_is_not_there_is_refused(monkeypatch):

@@ -17,7 +17,7 @@ from gymnasium.envs.classic_control.cartpole import CartPoleEnv
 
 from giril_rl.cli.command_line import main
 from giril_rl.envs import GymVectorEnv
-from giril_rl.files.checkpoint import load_state
+from giril_rl.runs.checkpoint import load_state
 from giril_rl.runs.metrics import read_metrics
 
 BATCH = 128

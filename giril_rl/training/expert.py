@@ -30,8 +30,8 @@ from giril_rl.files.disk import missing, remove_empty, remove_leftovers
 from giril_rl.policies.agent import load_agent, make_agent
 from giril_rl.policies.agents import Agent
 from giril_rl.runs.finished import read_result
-from giril_rl.runs.naming import NO_EFFECT, out_folder, safe, without_added
-from giril_rl.runs.randomness import check_device
+from giril_rl.runs.identity import NO_EFFECT, out_folder, safe, without_added
+from giril_rl.runs.machine import check_device
 from giril_rl.runs.run import Run
 from giril_rl.training.outlook import announce
 from giril_rl.training.ppo import train_ppo

@@ -11,7 +11,7 @@ from giril_rl.demos import Demonstration
 from giril_rl.demos.shipped import demonstration_folder, is_shipped
 from giril_rl.errors import UserError
 from giril_rl.runs.finished import read_config, read_part, read_result
-from giril_rl.runs.naming import config_hash
+from giril_rl.runs.identity import config_hash
 from giril_rl.training.expert import demonstration_place, expert_settings
 
 

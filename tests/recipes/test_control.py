@@ -10,7 +10,7 @@ from giril_rl.cli.command_line import main
 from giril_rl.config.recipe_files import copy, find
 from giril_rl.config.schema import TaskConfig
 from giril_rl.envs import GymVectorEnv, make_env
-from giril_rl.files.checkpoint import load_state
+from giril_rl.runs.checkpoint import load_state
 from giril_rl.runs.metrics import read_metrics
 from giril_rl.runs.run import Run
 

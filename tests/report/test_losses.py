@@ -1,6 +1,6 @@
 import csv
 
-from giril_rl.runs.losses import loss_points, write_losses
+from giril_rl.runs.curve import loss_points, write_losses
 
 ROWS = [
     {"phase": "bc", "step": 100, "bc/fitted/loss": 0.5, "bc/held_out/loss": 0.75},

@@ -11,7 +11,7 @@ import torch
 from safetensors.torch import save_file
 
 from giril_rl.errors import UserError
-from giril_rl.files.checkpoint import load_state, save_state
+from giril_rl.runs.checkpoint import load_state, save_state
 
 
 def same(left, right):
@@ -157,7 +157,7 @@ def test_unknown_format_version_and_foreign_file_are_refused(tmp_path):
 
 SAVER = """
 import sys, torch
-from giril_rl.files.checkpoint import save_state
+from giril_rl.runs.checkpoint import save_state
 torch.set_num_threads(1)
 for step in range(10**9):
     save_state(sys.argv[1], {"step": step, "x": torch.full((200_000,), float(step))})

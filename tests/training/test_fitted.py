@@ -16,7 +16,7 @@ from giril_rl.config.recipe_config import config_class
 from giril_rl.config.recipe_files import find
 from giril_rl.demos import Demonstration, shipped_demonstrations
 from giril_rl.errors import UserError
-from giril_rl.runs.naming import config_hash
+from giril_rl.runs.identity import config_hash
 from giril_rl.training import expert, fitted
 from giril_rl.training.fitted import find_demonstration
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from giril_rl.errors import UserError
-from giril_rl.runs.restoring import restoring
+from giril_rl.runs.checkpoint import restoring
 
 
 @pytest.mark.parametrize("error", [KeyError("step"), RuntimeError("size mismatch")])

@@ -25,7 +25,7 @@ from files import (
 
 from giril_rl.cli.command_line import main
 from giril_rl.errors import UserError
-from giril_rl.files.checkpoint import load_state, save_state
+from giril_rl.runs.checkpoint import load_state, save_state
 
 CALL = '!!python/object/apply:os.system ["touch mark"]'
 BOMB = "\n".join(

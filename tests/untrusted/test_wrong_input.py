@@ -86,7 +86,7 @@ def number(name, value, row=3):
 
 def checkpoint(change):
     def rewrite(folder):
-        from giril_rl.files.checkpoint import load_state, save_state
+        from giril_rl.runs.checkpoint import load_state, save_state
 
         state = load_state(folder / "ppo.safetensors")
         save_state(folder / "ppo.safetensors", change(state))
