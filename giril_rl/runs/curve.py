@@ -144,16 +144,7 @@ def write_losses(
 ) -> tuple[Path, Path]:
     """Write the losses of a run that learns without an environment against gradient steps.
 
-    Args:
-        folder: the folder of the two files.
-        rows: the run's metrics.
-        recipe: the method's name, for the title.
-        task: the task's name, for the title.
-        seed: the run's seed, for the title.
-        final_return: the mean score of the final evaluation, for the title.
-
-    Returns:
-        The paths of ``curve.csv`` and ``curve.png``.
+    Arguments and result are those of :func:`write_curve`.
 
     Examples:
         >>> import tempfile

@@ -42,10 +42,11 @@ def check_run_format(folder: Path, readable: Collection[int] = (1, RUN_FORMAT)) 
 
 
 def read_result(folder: Path) -> dict[str, Any]:
-    """A finished run's ``result.json``.
+    """A finished run's ``result.json``, with every entry checked.
 
     Raises:
-        UserError: if there is no finished run, or it is damaged or of a later format.
+        UserError: if there is no finished run, one of a later format, or one with an entry that no
+            run writes.
     """
     check_run_format(folder)
     path = folder / "result.json"
@@ -53,7 +54,13 @@ def read_result(folder: Path) -> dict[str, Any]:
         raise UserError(
             f"{folder} holds no finished run (no result.json): run it to its end first."
         )
-    return read_result_file(path)
+    result = read_json(path)
+    wrong = _first_wrong(result)
+    if wrong is not None:
+        raise UserError(
+            f"{path} has no {wrong} as a run writes it: restore a copy, or make the run anew."
+        )
+    return result
 
 
 def read_settings(folder: Path) -> tuple[TaskConfig, EvalConfig]:
@@ -146,111 +153,67 @@ def _no_run(folder: Path) -> UserError:
 Check = Callable[[Any], bool]
 
 
-def _word(value: Any) -> bool:
+def _text(value: Any) -> bool:
     return isinstance(value, str) and value != "" and value.isprintable()
 
 
-def _natural(value: Any) -> bool:
+def _count(value: Any) -> bool:
     return type(value) is int and 0 <= value < 2**63
 
 
 def _number(value: Any) -> bool:
-    return _natural(abs(value)) if type(value) is int else _real(value)
-
-
-def _real(value: Any) -> bool:
+    if type(value) is int:
+        return _count(abs(value))
     return isinstance(value, float) and math.isfinite(value)
+
+
+def _is(kind: type) -> Check:
+    return lambda value: isinstance(value, kind)
 
 
 def _or_none(check: Check) -> Check:
     return lambda value: value is None or check(value)
 
 
-def _flag(value: Any) -> bool:
-    return isinstance(value, bool)
-
-
-def _mapping(value: Any) -> bool:
-    return isinstance(value, dict)
-
-
-SCORES: dict[str, Check] = {
-    "return_mean": _number,
-    "return_std": _number,
-    "return_median": _number,
-    "episode_length_mean": _number,
+_SCORES: dict[str, Check] = dict.fromkeys(
+    ("return_mean", "return_std", "return_median", "episode_length_mean"), _number
+)
+_NEEDED: dict[str, Check] = {
+    **dict.fromkeys(("method", "task"), _text),
+    **dict.fromkeys(("seed", "env_steps", "episodes"), _count),
+    **_SCORES,
+    "config_hash": _text,
 }
-NEEDED: dict[str, Check] = {
-    "method": _word,
-    "task": _word,
-    "seed": _natural,
-    "env_steps": _natural,
-    "episodes": _natural,
-    **SCORES,
-    "config_hash": _word,
+_SECONDS_AND_RETURNS = (
+    *("wall_seconds", "fit_seconds", "steps_per_second"),
+    *("life_length_mean", "expert_return_mean", "demo_return_mean"),
+)
+# Some kinds of runs, and runs of earlier versions, do not have these.
+_OPTIONAL: dict[str, Check] = {
+    **dict.fromkeys(("seeds", "versions"), _is(dict)),
+    "deterministic": _or_none(_is(dict)),
+    **dict.fromkeys(("profile", "demo", "demo_id", "processor"), _or_none(_text)),
+    **dict.fromkeys(_SECONDS_AND_RETURNS, _or_none(_number)),
+    **dict.fromkeys(("inexact_resumes", "held_action"), _count),
+    "demo_transitions": _or_none(_count),
+    "random_policy": _is(bool),
 }
-"""Entries of every ``result.json``, each with its check."""
-OPTIONAL: dict[str, Check] = {
-    "profile": _or_none(_word),
-    "seeds": _mapping,
-    "deterministic": _or_none(_mapping),
-    "life_length_mean": _or_none(_number),
-    "wall_seconds": _or_none(_number),
-    "fit_seconds": _or_none(_number),
-    "inexact_resumes": _natural,
-    "steps_per_second": _or_none(_number),
-    "expert_return_mean": _or_none(_number),
-    "demo_return_mean": _or_none(_number),
-    "demo": _or_none(_word),
-    "demo_id": _or_none(_word),
-    "demo_transitions": _or_none(_natural),
-    "processor": _or_none(_word),
-    "held_action": _natural,
-    "random_policy": _flag,
-    "versions": _mapping,
-}
-"""Entries that some kinds of runs, or runs of earlier versions, do not have."""
-
-
-def read_result_file(path: Path) -> dict[str, Any]:
-    """A ``result.json``, with every entry checked.
-
-    Raises:
-        UserError: if it cannot be read, or has an entry that no run writes.
-
-    Examples:
-        >>> import tempfile
-        >>> path = Path(tempfile.mkdtemp()) / "result.json"
-        >>> _ = path.write_text('{"method": "giril", "task": "hopper", "seed": -1}')
-        >>> read_result_file(path)  # doctest: +ELLIPSIS
-        Traceback (most recent call last):
-        ...
-        giril_rl.errors.UserError: ...result.json has no seed as a run writes it: ...
-    """
-    result = read_json(path)
-    wrong = _first_wrong(result)
-    if wrong is not None:
-        raise UserError(
-            f"{path} has no {wrong} as a run writes it: restore a copy, or make the run anew."
-        )
-    return result
 
 
 def _first_wrong(result: dict[str, Any]) -> str | None:
-    for key, check in NEEDED.items():
+    """The first entry of a ``result.json`` that no run writes."""
+    for key, check in _NEEDED.items():
         if not check(result.get(key)):
             return key
-    for key, check in OPTIONAL.items():
+    for key, check in _OPTIONAL.items():
         if key in result and not check(result[key]):
             return key
-    for key, seed in result.get("seeds", {}).items():
-        if not _or_none(_natural)(seed):
-            return f"seeds.{key}" if _word(key) else "seeds"
-    for key, text in result.get("versions", {}).items():
-        if not _or_none(_word)(text):
-            return f"versions.{key}" if _word(key) else "versions"
+    for part, check in (("seeds", _count), ("versions", _text)):
+        for key, value in result.get(part, {}).items():
+            if not _or_none(check)(value):
+                return f"{part}.{key}" if _text(key) else part
     mode = result.get("deterministic")
-    for key, check in SCORES.items():
+    for key, check in _SCORES.items():
         if mode is not None and not check(mode.get(key)):
             return f"deterministic.{key}"
     return None

@@ -5,17 +5,12 @@ from __future__ import annotations
 import os
 import signal
 import threading
-from types import FrameType, TracebackType
+from types import FrameType
 from typing import Any
 
 
 class Interrupted(KeyboardInterrupt):
-    """A loop was asked to stop, and has saved its state.
-
-    Examples:
-        >>> str(Interrupted.at(120_000, 300_000))
-        'interrupted at 120,000 of 300,000 steps: the same command continues from there'
-    """
+    """A loop was asked to stop, and has saved its state."""
 
     @classmethod
     def at(
@@ -31,6 +26,8 @@ class Interrupted(KeyboardInterrupt):
             most: whether the part may end before ``total``.
 
         Examples:
+            >>> str(Interrupted.at(120_000, 300_000))
+            'interrupted at 120,000 of 300,000 steps: the same command continues from there'
             >>> str(Interrupted.at(2_000, 5_000_000, part="the player's training", most=True))
             "interrupted in the player's training at 2,000 of at most 5,000,000 steps: the same
             command continues from there"
@@ -85,12 +82,7 @@ class Interrupt:
                     signal.signal(number, self._handle)
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *raised: object) -> None:
         self._requested, self._shared = self.requested, None
         if Interrupt._outer is self:
             Interrupt._outer = None

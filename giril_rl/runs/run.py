@@ -7,7 +7,6 @@ import json
 import warnings
 from collections.abc import Collection, Mapping
 from pathlib import Path
-from types import TracebackType
 from typing import Any, TypeVar
 
 import yaml
@@ -229,13 +228,8 @@ class Run:
     def __enter__(self) -> Run:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close(error)
+    def __exit__(self, *raised: Any) -> None:
+        self.close(raised[1])
 
     def _refuse_foreign_folder(self) -> None:
         if not self.folder.exists() or (self.folder / "config.yaml").exists():
