@@ -1,8 +1,8 @@
 """Sharing a trained module as a folder of weights and a card.
 
-``huggingface_hub.PyTorchModelHubMixin`` writes a similar folder. We do not use it: it knows only one
-constructor of a class, has no format number and no refusal in one sentence, and would be one more
-dependency for two small files.
+``huggingface_hub.PyTorchModelHubMixin`` writes a similar folder. We do not use it: it knows only
+one constructor of a class, has no format number and no refusal in one sentence, and would be one
+more dependency for two small files.
 """
 
 from __future__ import annotations
