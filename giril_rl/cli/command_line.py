@@ -82,8 +82,7 @@ def _run(argv: Sequence[str]) -> int:
     from giril_rl.config.jobs import Job, Jobs
     from giril_rl.config.overrides import sweep
     from giril_rl.config.validation import notices
-    from giril_rl.runs.identity import is_scored_as, out_folder
-    from giril_rl.runs.identity import check_sources, making, sources
+    from giril_rl.runs.identity import check_sources, is_scored_as, making, out_folder, sources
 
     composing = Jobs()
     jobs: dict[Path, tuple[Job, list[str]]] = {}

@@ -18,11 +18,11 @@ from giril_rl.networks.normalise import RunningNormaliser
 from giril_rl.policies.agents import Agent
 from giril_rl.policies.policy import NORMALISED
 from giril_rl.rewards.chunks import PIXELS_AT_ONCE
+from giril_rl.runs.checkpoint import restoring
 from giril_rl.runs.finite_checks import Finite
 from giril_rl.runs.interrupt import Interrupt, Interrupted
 from giril_rl.runs.progress import progress
 from giril_rl.runs.randomness import stream_seed
-from giril_rl.runs.checkpoint import restoring
 from giril_rl.training.ppo import Trained
 
 if TYPE_CHECKING:

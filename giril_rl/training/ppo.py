@@ -23,11 +23,11 @@ from giril_rl.errors import UserError
 from giril_rl.graphs.traced import TracedGradients
 from giril_rl.policies.agents import Agent, check_actions
 from giril_rl.policies.recorded_acting import collecting
+from giril_rl.runs.checkpoint import restoring
 from giril_rl.runs.finite_checks import Finite
 from giril_rl.runs.interrupt import Interrupt, Interrupted
 from giril_rl.runs.progress import progress
 from giril_rl.runs.randomness import Use, restore_rng, rng_state, stream_seed
-from giril_rl.runs.checkpoint import restoring
 from giril_rl.training.episodes import EpisodeTracker
 from giril_rl.training.threads import made_on_one_thread
 from giril_rl.transforms.batch_mean import BatchMeanReward

@@ -10,7 +10,6 @@ from torchrl.envs import Compose
 
 from giril_rl.config.schema import AdversarialConfig, PPOConfig
 from giril_rl.envs import GymVectorEnv
-from giril_rl.runs.checkpoint import load_state, save_state
 from giril_rl.policies.agent import make_agent
 from giril_rl.rewards import (
     BottleneckLoss,
@@ -18,6 +17,7 @@ from giril_rl.rewards import (
     DiscriminatorLoss,
     DiscriminatorReward,
 )
+from giril_rl.runs.checkpoint import load_state, save_state
 from giril_rl.runs.interrupt import Interrupted
 from giril_rl.runs.run import Run
 from giril_rl.training.adversarial import AdversarialLearner

@@ -11,8 +11,8 @@ from torchrl.envs import Compose
 from giril_rl.config.schema import EvalConfig, PPOConfig, RunConfig, TaskConfig
 from giril_rl.envs import GymVectorEnv
 from giril_rl.runs.checkpoint import load_state
-from giril_rl.runs.metrics import read_metrics
 from giril_rl.runs.finished import read_result
+from giril_rl.runs.metrics import read_metrics
 from giril_rl.training import RandomPolicy, Run, Trained, finish_run, make_agent, train_ppo
 from giril_rl.training.episodes import EpisodeTracker
 from giril_rl.training.ppo import forget_episodes
