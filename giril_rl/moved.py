@@ -17,7 +17,7 @@ MOVED = {
     "networks.pixel_policy": "policies.pixel_policy",
     "networks.policy": "policies.policy",
     "pretrained": "runs.pretrained",
-    "training.checkpoint": "files.checkpoint",
+    "training.checkpoint": "runs.checkpoint",
     "training.run": "runs.run",
 }
 """What version 0.1 documented, or a copied recipe of its imports, below ``giril_rl``."""

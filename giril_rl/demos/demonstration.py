@@ -18,7 +18,7 @@ from giril_rl.demos.frames import FRAMES_FILE, load_frames, save_frames
 from giril_rl.demos.storage import load_tensors, save_tensors
 from giril_rl.errors import UserError
 from giril_rl.files.disk import name_file, read_json, temporary_sibling, write_json
-from giril_rl.files.formats import check_format
+from giril_rl.files.untrusted import check_format
 
 FORMAT_VERSION = 1
 """Of vectors."""

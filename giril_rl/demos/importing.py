@@ -19,7 +19,7 @@ from giril_rl.demos.storage import load_tensors
 from giril_rl.demos.task import as_recorded_task, check_for_task
 from giril_rl.envs import gym_factory
 from giril_rl.errors import UserError
-from giril_rl.files.disk import installed_versions
+from giril_rl.runs.machine import installed_versions
 
 MINARI = "minari:"
 _DTYPES = ("float32", "float64", "uint8", "int8", "int16", "int32", "int64", "bool")

@@ -20,7 +20,7 @@ from giril_rl.envs.checking import check_reset, check_step, env_name
 from giril_rl.envs.spaces import check_action_space
 from giril_rl.envs.stdout import silent_stdout
 from giril_rl.errors import UserError
-from giril_rl.files.disk import installed_versions, processor
+from giril_rl.runs.machine import installed_versions, processor
 from giril_rl.runs.progress import progress
 from giril_rl.runs.randomness import seeded, stream_seed
 
@@ -110,9 +110,9 @@ def record_demonstration(
             torch.no_grad(),
             progress(total or 0, desc="demonstration", unit=unit, disable=not show_progress) as bar,
         ):
-            while bar.done < (total or 0):
+            while bar.n < (total or 0):
                 own = episode_seed(seed, next(numbers))
-                most = _LONGEST_EPISODE if length is None else length - bar.done
+                most = _LONGEST_EPISODE if length is None else length - bar.n
                 played, counted = _play(env, policy, own, most)
                 if length is None and not played[-1]["done"]:
                     raise UserError(

@@ -24,7 +24,7 @@ from giril_rl.files.disk import remove_leftovers
 from giril_rl.policies.agent import load_agent
 from giril_rl.policies.agents import Agent
 from giril_rl.runs.finished import read_config, read_part, read_result
-from giril_rl.runs.naming import NO_EFFECT, config_hash, out_folder, safe, without_added
+from giril_rl.runs.identity import NO_EFFECT, config_hash, out_folder, safe, without_added
 from giril_rl.runs.run import Run
 from giril_rl.training.outlook import announce
 from giril_rl.training.players import check_task, expert_settings, made_once, obtain_expert

@@ -12,11 +12,11 @@ from torchrl.objectives import LossModule
 from giril_rl.config.schema import FitConfig
 from giril_rl.graphs.traced import TracedGradients
 from giril_rl.rewards.chunks import PIXELS_AT_ONCE
-from giril_rl.runs.finite import Finite
+from giril_rl.runs.checkpoint import restoring
+from giril_rl.runs.finite_checks import Finite
 from giril_rl.runs.interrupt import Interrupt, Interrupted
 from giril_rl.runs.progress import progress
 from giril_rl.runs.randomness import restore_rng, rng_state, seeded, stream_seed
-from giril_rl.runs.restoring import restoring
 from giril_rl.runs.run import Run
 
 CHECKPOINT_EVERY = 5_000

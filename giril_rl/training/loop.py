@@ -17,11 +17,11 @@ from torchrl.collectors import Collector
 
 from giril_rl.envs import BatchedEnv
 from giril_rl.policies.agents import check_actions
-from giril_rl.runs.finite import Finite
+from giril_rl.runs.checkpoint import restoring
+from giril_rl.runs.finite_checks import Finite
 from giril_rl.runs.interrupt import Interrupt, Interrupted
 from giril_rl.runs.progress import progress
 from giril_rl.runs.randomness import Use, restore_rng, rng_state, stream_seed
-from giril_rl.runs.restoring import restoring
 from giril_rl.runs.run import Run
 from giril_rl.training.algorithm import Algorithm
 from giril_rl.training.episodes import EpisodeTracker

@@ -20,8 +20,8 @@ from giril_rl.errors import UserError
 from giril_rl.files.disk import missing, remove_empty
 from giril_rl.policies.agent import make_agent
 from giril_rl.runs.finished import read_result
-from giril_rl.runs.naming import out_folder
-from giril_rl.runs.randomness import check_device
+from giril_rl.runs.identity import out_folder
+from giril_rl.runs.machine import check_device
 from giril_rl.runs.run import Run
 from giril_rl.training.loop import train_policy
 from giril_rl.training.ppo import PPO, return_scaling

@@ -13,8 +13,7 @@ from filelock import FileLock, Timeout
 from giril_rl.config.imports import named_modules
 from giril_rl.config.schema import EvalConfig, TaskConfig
 from giril_rl.errors import UserError
-from giril_rl.files.disk import write_atomically, write_json
-from giril_rl.files.places import check_place
+from giril_rl.files.disk import check_place, write_atomically, write_json
 from giril_rl.policies.agent import load_agent
 from giril_rl.runs.finished import (
     print_both,

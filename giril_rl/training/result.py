@@ -10,13 +10,12 @@ from torch import nn
 from giril_rl.config.schema import AveragedRunConfig, DemoConfig, RunConfig
 from giril_rl.demos import Demonstration
 from giril_rl.demos.shipped import demonstration_name
-from giril_rl.files.disk import processor
 from giril_rl.policies.agent import POLICY
 from giril_rl.policies.agents import Agent
-from giril_rl.runs.curve import write_curve
-from giril_rl.runs.losses import loss_points, write_losses
+from giril_rl.runs.curve import loss_points, write_curve, write_losses
+from giril_rl.runs.identity import config_hash
+from giril_rl.runs.machine import processor
 from giril_rl.runs.metrics import METRICS, read_metrics
-from giril_rl.runs.naming import config_hash
 from giril_rl.runs.pretrained import Pretrained
 from giril_rl.runs.run import Run
 from giril_rl.training.baselines import HeldAction, RandomPolicy

@@ -39,7 +39,7 @@ from giril_rl.config.schema import RunConfig, TaskConfig
 from giril_rl.config.task_defaults import apply_task_defaults
 from giril_rl.envs import make_env
 from giril_rl.rewards import GenerativeReward
-from giril_rl.runs.allocator import keep_freed_memory
+from giril_rl.runs.machine import keep_freed_memory
 from giril_rl.training import PPO, Run, make_agent, train_policy
 from giril_rl.transforms import BatchMeanReward, IntrinsicReward, ReturnScaling
 

@@ -10,7 +10,7 @@ from torchrl.envs.utils import check_env_specs
 from giril_rl.config.schema import TaskConfig
 from giril_rl.envs import FixedHorizonEnv, GymVectorEnv, make_env, with_own_episodes
 from giril_rl.errors import UserError
-from giril_rl.files.checkpoint import load_state, save_state
+from giril_rl.runs.checkpoint import load_state, save_state
 from giril_rl.runs.randomness import stream_seed
 
 KEYS = ["observation", "action"] + [

@@ -5,12 +5,13 @@ import math
 
 import gymnasium
 import pytest
+from short_runs import rows, weights
 
 from giril_rl.cli.command_line import main
 from giril_rl.config.recipe_files import copy, find
 from giril_rl.config.schema import TaskConfig
 from giril_rl.envs import GymVectorEnv, make_env
-from giril_rl.files.checkpoint import load_state
+from giril_rl.runs.checkpoint import load_state
 from giril_rl.runs.metrics import read_metrics
 from giril_rl.runs.run import Run
 
@@ -63,17 +64,6 @@ def run(recipe, out, root, *more, code=0):
     by_key = {word.split("=")[0]: word for word in [*TINY, *more]}
     assert main(["run", recipe, f"out={out}", f"root={root}", *by_key.values()]) == code
     return json.loads((out / "result.json").read_text()) if code == 0 else None
-
-
-def weights(folder):
-    state = load_state(folder / "policy/model.safetensors")
-    return {name: value.tolist() for name, value in state.items()}
-
-
-def rows(folder):
-    """Metrics less what a clock says, in their order."""
-    found = read_metrics(folder / "metrics.jsonl")
-    return [{k: v for k, v in row.items() if "seconds" not in k} for row in found]
 
 
 def starts(seed, episodes):

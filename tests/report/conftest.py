@@ -10,7 +10,7 @@ import yaml
 from giril_rl.config.compose import resolved
 from giril_rl.config.recipe_config import config_class
 from giril_rl.config.recipe_files import find
-from giril_rl.runs.naming import config_hash
+from giril_rl.runs.identity import config_hash
 
 
 @cache

@@ -15,7 +15,7 @@ from giril_rl.experiments.report.rows import panels_of
 from giril_rl.experiments.report.runs import read_runs
 from giril_rl.rewards import GenerativeReward
 from giril_rl.runs.finished import read_config, read_part, read_settings
-from giril_rl.runs.naming import config_hash
+from giril_rl.runs.identity import config_hash
 from giril_rl.training import make_agent
 from giril_rl.training.demonstrations import demonstration_place
 from giril_rl.training.players import expert_settings

@@ -1,18 +1,15 @@
 """The discriminator beside the policy: by itself, and in PPO's loop through ``learn_reward``."""
 
-import signal
-
 import gymnasium
-import numpy as np
 import pytest
 import torch
+from short_runs import Garbage, Killed, rows, stopped
 from tensordict import TensorDict
 from torchrl.data import Bounded, Categorical
 from torchrl.envs import Compose
 
 from giril_rl.config.schema import AdversarialConfig, PPOConfig
 from giril_rl.envs import GymVectorEnv
-from giril_rl.files.checkpoint import load_state, save_state
 from giril_rl.policies.agent import make_agent
 from giril_rl.rewards import (
     BottleneckLoss,
@@ -20,8 +17,8 @@ from giril_rl.rewards import (
     DiscriminatorLoss,
     DiscriminatorReward,
 )
+from giril_rl.runs.checkpoint import load_state, save_state
 from giril_rl.runs.interrupt import Interrupted
-from giril_rl.runs.metrics import read_metrics
 from giril_rl.runs.run import Run
 from giril_rl.training.loop import train_policy
 from giril_rl.training.ppo import PPO
@@ -135,9 +132,9 @@ def test_minibatches_come_from_both_sets(monkeypatch):
     for which, data in ((0, pairs(20, seed=9)), (2, batch.reshape(-1))):
         known = torch.cat((data["observation"], data["action"]), 1).tolist()
         drawn = [torch.cat(inputs[which : which + 2], 1).tolist() for inputs in seen]
-        for rows in drawn:
-            assert all(row in known for row in rows)
-            assert len({tuple(row) for row in rows}) == 16
+        for lines in drawn:
+            assert all(row in known for row in lines)
+            assert len({tuple(row) for row in lines}) == 16
         assert drawn[0] != drawn[1]
 
 
@@ -192,23 +189,6 @@ BATCH = 4 * 32
 ENVS = {"discrete": "CartPole-v1", "box": "Pendulum-v1"}
 
 
-class Garbage(gymnasium.Wrapper):
-    """The environment with another reward."""
-
-    def __init__(self, env, kind):
-        super().__init__(env)
-        self.rng = np.random.default_rng(7)
-        self.kind = kind
-
-    def step(self, action):
-        observation, reward, *rest = self.env.step(action)
-        if self.kind == "noise":
-            reward = 1e3 * self.rng.normal()
-        elif self.kind == "nan":
-            reward = float("nan")
-        return observation, reward, *rest
-
-
 def train(folder, *, method="gail", kind="discrete", garbage=None, steps=4 * BATCH, learn=True):
     """Trains in ``folder`` with objects of its own; the checkpoint."""
 
@@ -236,35 +216,13 @@ def train(folder, *, method="gail", kind="discrete", garbage=None, steps=4 * BAT
     return state
 
 
-def rows(folder):
-    """Metrics less what a clock says."""
-    return [
-        {key: value for key, value in row.items() if "seconds" not in key}
-        for row in read_metrics(folder / "metrics.jsonl")
-    ]
-
-
-class Killed(Exception):
-    """Stands for kill -9: nothing is saved after it."""
-
-
 @pytest.mark.parametrize(("method", "kind"), [("gail", "discrete"), ("vail", "box")])
 def test_a_run_stopped_again_and_again_ends_bit_for_bit_as_an_undisturbed_one(
-    method, kind, tmp_path, monkeypatch
+    method, kind, tmp_path
 ):
     expected = train(tmp_path / "whole", method=method, kind=kind)
-    log = Run.log
     for number, how in ((1, Killed), (1, Interrupted), (3, Killed), (3, Interrupted)):
-        with monkeypatch.context() as patch, pytest.raises(how):
-
-            def log_and_stop(self, step, values, *, phase, number=number, how=how):
-                log(self, step, values, phase=phase)
-                if step == number * BATCH:
-                    if how is Killed:
-                        raise Killed
-                    signal.raise_signal(signal.SIGINT)
-
-            patch.setattr(Run, "log", log_and_stop)
+        with stopped(how, number * BATCH):
             train(tmp_path / "run", method=method, kind=kind)
         torch.manual_seed(1234 + number)
     found = train(tmp_path / "run", method=method, kind=kind)

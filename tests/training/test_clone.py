@@ -1,16 +1,15 @@
-import signal
-
 import pytest
 import torch
 import torch.nn.functional as F
+from short_runs import Killed, stopped
 from tensordict import TensorDict
 from torchrl.data import Bounded, Categorical, OneHot
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from giril_rl.config.schema import BCConfig
 from giril_rl.errors import UserError
-from giril_rl.files.checkpoint import load_state
 from giril_rl.policies.policy import NORMALISED, ActorCritic
+from giril_rl.runs.checkpoint import load_state
 from giril_rl.runs.interrupt import Interrupted
 from giril_rl.runs.metrics import read_metrics
 from giril_rl.runs.run import Run
@@ -264,10 +263,6 @@ def test_seeds_and_data_decide_everything(tmp_path):
     assert same(whole, cloned(tmp_path / "whole1", stop="fixed", batch=40, seed=1)[0])
 
 
-class Killed(Exception):
-    """Stands for kill -9: nothing is saved after it."""
-
-
 @pytest.mark.parametrize("stop", ["held_out", "fixed"])
 def test_a_cloning_stopped_again_and_again_ends_bit_for_bit_as_an_undisturbed_one(
     stop, tmp_path, monkeypatch
@@ -275,18 +270,8 @@ def test_a_cloning_stopped_again_and_again_ends_bit_for_bit_as_an_undisturbed_on
     monkeypatch.setattr(cloning, "CHECKPOINT_EVERY", 20)
     settings = {"stop": stop, "batch": 4, "steps": 60, "weight_decay": 0.1}
     whole, rows = noisy(tmp_path / "whole", **settings)
-    log = Run.log
     for number, how in ((1, Killed), (1, Interrupted), (3, Killed), (6, Interrupted)):
-        with monkeypatch.context() as patch, pytest.raises(how):
-
-            def log_and_stop(self, step, values, *, phase, number=number, how=how):
-                log(self, step, values, phase=phase)
-                if step >= number * 10:
-                    if how is Killed:
-                        raise Killed
-                    signal.raise_signal(signal.SIGINT)
-
-            patch.setattr(Run, "log", log_and_stop)
+        with stopped(how, number * 10):
             noisy(tmp_path / "run", **settings)
         torch.manual_seed(99)
     agent, found = noisy(tmp_path / "run", **settings)

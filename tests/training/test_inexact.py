@@ -10,9 +10,9 @@ from torchrl.envs import Compose
 
 from giril_rl.config.schema import EvalConfig, PPOConfig, RunConfig, TaskConfig
 from giril_rl.envs import GymVectorEnv
-from giril_rl.files.checkpoint import load_state
+from giril_rl.runs.checkpoint import load_state
+from giril_rl.runs.finished import read_result
 from giril_rl.runs.metrics import read_metrics
-from giril_rl.runs.result_file import read_result_file
 from giril_rl.training import PPO, RandomPolicy, Run, Trained, finish_run, make_agent
 from giril_rl.training.episodes import EpisodeTracker
 from giril_rl.training.loop import forget_episodes, train_policy
@@ -99,4 +99,4 @@ def test_result_json_says_it(tmp_path):
     cfg = RunConfig(task=task, eval=EvalConfig(episodes=1))
     with Run.open(tmp_path, {}, recipe="x") as run:
         finish_run(run, cfg, RandomPolicy.of_task(task), Trained(0, 1.0, 3))
-    assert read_result_file(tmp_path / "result.json")["inexact_resumes"] == 3
+    assert read_result(tmp_path)["inexact_resumes"] == 3

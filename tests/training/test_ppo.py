@@ -1,10 +1,10 @@
-import signal
 from functools import partial
 
 import gymnasium
 import numpy as np
 import pytest
 import torch
+from short_runs import Garbage, Killed, rows, stopped
 from tensordict import TensorDict
 from torch import nn
 from torchrl.data import Bounded, Categorical, OneHot
@@ -13,13 +13,12 @@ from torchrl.envs import Compose
 from giril_rl.config.schema import PPOConfig, TaskConfig
 from giril_rl.envs import GymVectorEnv, make_env
 from giril_rl.errors import UserError
-from giril_rl.files.checkpoint import load_state
 from giril_rl.policies.agent import make_agent
 from giril_rl.policies.pixel_policy import PixelActorCritic
 from giril_rl.policies.policy import NORMALISED, ActorCritic
 from giril_rl.rewards import GenerativeReward
+from giril_rl.runs.checkpoint import load_state
 from giril_rl.runs.interrupt import Interrupted
-from giril_rl.runs.metrics import read_metrics
 from giril_rl.runs.run import Run
 from giril_rl.training.loop import train_policy
 from giril_rl.training.ppo import PPO
@@ -46,14 +45,6 @@ def learned_reward(env, *, beta=1.0, batch_mean=True, seed=0):
     )
     mean = [BatchMeanReward()] if batch_mean else []
     return Compose(IntrinsicReward(reward), *mean, ReturnScaling(0.99))
-
-
-def rows(folder):
-    """Metrics less what a clock says."""
-    return [
-        {key: value for key, value in row.items() if "seconds" not in key}
-        for row in read_metrics(folder / "metrics.jsonl")
-    ]
 
 
 def assert_equal(found, expected, path=""):
@@ -308,24 +299,6 @@ def train(
     return trained, state
 
 
-class Killed(Exception):
-    """Stands for kill -9: nothing is saved after it."""
-
-
-def stop_in_batch(monkeypatch, number, how):
-    """Lets the training be killed or interrupted while it works on its batch ``number``."""
-    log = Run.log
-
-    def log_and_stop(self, step, values, *, phase):
-        log(self, step, values, phase=phase)
-        if step == number * BATCH:
-            if how is Killed:
-                raise Killed
-            signal.raise_signal(signal.SIGINT)
-
-    monkeypatch.setattr(Run, "log", log_and_stop)
-
-
 CASES = {
     "cartpole": {"env_id": "CartPole-v1"},
     "bullet, noisy reward": {
@@ -346,16 +319,13 @@ CASES = {
 
 
 @pytest.mark.parametrize("case", [*CASES, pytest.param("compiled", marks=pytest.mark.slow)])
-def test_a_run_stopped_again_and_again_ends_bit_for_bit_as_an_undisturbed_one(
-    case, tmp_path, monkeypatch
-):
+def test_a_run_stopped_again_and_again_ends_bit_for_bit_as_an_undisturbed_one(case, tmp_path):
     settings = CASES.get(case, {"compile": True})
     _, expected = train(tmp_path / "whole", **settings)
     # Before the first checkpoint; at an extra checkpoint; between two checkpoints; at the end.
     stops = (1, Killed), (1, Interrupted), (3, Killed), (3, Interrupted), (4, Interrupted)
     for number, how in stops:
-        with monkeypatch.context() as patch, pytest.raises(how):
-            stop_in_batch(patch, number, how)
+        with stopped(how, number * BATCH):
             train(tmp_path / "run", **settings)
         if how is Interrupted:
             saved = load_state(tmp_path / "run" / "ppo.safetensors")
@@ -399,23 +369,6 @@ def test_the_tracker_and_metrics_tell_true_returns(tmp_path):
         assert 0 < row["train/episodes"] <= BATCH / 8
         assert row["ppo/reward_mean"] != 1.0
     assert np.isfinite([value for row in found for value in list(row.values())[1:]]).all()
-
-
-class Garbage(gymnasium.Wrapper):
-    """The environment with another reward."""
-
-    def __init__(self, env, kind):
-        super().__init__(env)
-        self.rng = np.random.default_rng(7)
-        self.kind = kind
-
-    def step(self, action):
-        observation, reward, *rest = self.env.step(action)
-        if self.kind == "noise":
-            reward = 1e3 * self.rng.normal()
-        elif self.kind == "nan":
-            reward = float("nan")
-        return observation, reward, *rest
 
 
 def trained_on(kind, folder, relabel, env_id):

@@ -1,9 +1,8 @@
 """PPO on frames: advantages without a second pass, exact resumption, whole games in the log."""
 
-import signal
-
 import pytest
 import torch
+from short_runs import Killed, rows, stopped
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch.utils._pytree import tree_flatten
@@ -16,7 +15,6 @@ from giril_rl.policies.agent import make_agent
 from giril_rl.policies.pixel_policy import PixelActorCritic
 from giril_rl.rewards import GenerativeReward
 from giril_rl.runs.interrupt import Interrupted
-from giril_rl.runs.metrics import read_metrics
 from giril_rl.runs.run import Run
 from giril_rl.training.loop import train_policy
 from giril_rl.training.ppo import PPO
@@ -149,14 +147,6 @@ def learned_reward(env):
     return Compose(IntrinsicReward(reward), BatchMeanReward(), ReturnScaling(0.99))
 
 
-def rows(folder):
-    """Metrics less what a clock says."""
-    return [
-        {key: value for key, value in row.items() if "seconds" not in key}
-        for row in read_metrics(folder / "metrics.jsonl")
-    ]
-
-
 def train(folder, *, steps=4 * BATCH, env=AtariEnv, relabel=learned_reward, seed=0, **kwargs):
     """Trains in ``folder`` with objects of its own; all that the last checkpoint holds."""
     pytest.importorskip("ale_py")
@@ -185,30 +175,10 @@ def policy(state):
     return state["algorithm"]["agent"]
 
 
-class Killed(Exception):
-    """Stands for kill -9: nothing is saved after it."""
-
-
-def stop_in_batch(monkeypatch, number, how):
-    log = Run.log
-
-    def log_and_stop(self, step, values, *, phase):
-        log(self, step, values, phase=phase)
-        if step == number * BATCH:
-            if how is Killed:
-                raise Killed
-            signal.raise_signal(signal.SIGINT)
-
-    monkeypatch.setattr(Run, "log", log_and_stop)
-
-
-def test_a_run_stopped_again_and_again_ends_bit_for_bit_as_an_undisturbed_one(
-    tmp_path, monkeypatch
-):
+def test_a_run_stopped_again_and_again_ends_bit_for_bit_as_an_undisturbed_one(tmp_path):
     expected = train(tmp_path / "whole")
     for number, how in ((1, Interrupted), (3, Killed)):
-        with monkeypatch.context() as patch, pytest.raises(how):
-            stop_in_batch(patch, number, how)
+        with stopped(how, number * BATCH):
             train(tmp_path / "run")
         torch.manual_seed(1234 + number)  # As in a new process.
     assert same(train(tmp_path / "run"), expected)

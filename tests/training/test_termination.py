@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from short_runs import Killed, rows
 from tensordict import TensorDict
 from torch import nn
 from torchrl.data import Bounded
@@ -13,7 +14,6 @@ from giril_rl.envs import make_env
 from giril_rl.errors import UserError
 from giril_rl.policies.agent import make_agent
 from giril_rl.policies.policy import ActorCritic
-from giril_rl.runs.metrics import read_metrics
 from giril_rl.runs.run import Run
 from giril_rl.training.loop import train_policy
 from giril_rl.training.ppo import PPO
@@ -124,14 +124,7 @@ def train(folder, **task):
             run=run,
         )
     env.close()
-    rows = read_metrics(folder / "metrics.jsonl")
-    return dict(agent.state_dict()), [
-        {k: v for k, v in row.items() if "seconds" not in k} for row in rows
-    ]
-
-
-class Killed(Exception):
-    """Stands for kill -9: nothing is saved after it."""
+    return dict(agent.state_dict()), rows(folder)
 
 
 CASES = {

@@ -10,7 +10,7 @@ from torchrl.objectives import ClipPPOLoss
 from giril_rl.graphs.traced import TracedGradients
 from giril_rl.policies.policy import NORMALISED, ActorCritic
 from giril_rl.rewards import GenerativeReward, GenerativeRewardLoss
-from giril_rl.training.ppo import LEARNER_KEYS, RecordableClipPPOLoss
+from giril_rl.training.ppo import LOSS_KEYS, RecordableClipPPOLoss
 
 SPECS = {"box": Bounded(-1, 1, shape=(1, 2)), "discrete": Categorical(3, shape=(1,))}
 LOG = ("kl_approx", "clip_fraction")
@@ -23,7 +23,7 @@ class PPO:
 
     def __init__(self, kind):
         self.agent = ActorCritic(4, SPECS[kind], hidden=(16, 16))
-        self.keys = (NORMALISED, self.agent.drawn_key, *LEARNER_KEYS)
+        self.keys = (NORMALISED, self.agent.drawn_key, *LOSS_KEYS)
         with torch.no_grad():
             for parameter in self.agent.parameters():
                 parameter.add_(0.2 * torch.randn_like(parameter))

@@ -11,7 +11,7 @@ from giril_rl.experiments.report.formats import budget_text, seeds_text
 from giril_rl.experiments.report.rows import Panel, Row, longest
 from giril_rl.experiments.report.statistics import Estimate, mean_and_iqm
 from giril_rl.experiments.report.style import BLACK, GREY
-from giril_rl.runs.drawing import new_figure, save
+from giril_rl.runs.curve import new_figure, save
 
 
 def comparable(panels: Sequence[Panel]) -> list[tuple[Panel, list[Row]]]:

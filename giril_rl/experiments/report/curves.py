@@ -14,8 +14,7 @@ from giril_rl.experiments.report.rows import Panel, Row, longest
 from giril_rl.experiments.report.statistics import band
 from giril_rl.experiments.report.style import DEMONSTRATION, EXPERT, PALETTE, Look
 from giril_rl.experiments.report.tables import Table
-from giril_rl.runs.curve import curve_points
-from giril_rl.runs.drawing import new_figure, save, thousands
+from giril_rl.runs.curve import curve_points, new_figure, save, thousands
 
 BINS = 50
 LEGEND = 70  # characters in a line of a legend

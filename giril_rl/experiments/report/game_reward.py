@@ -12,7 +12,7 @@ from tensordict.nn import TensorDictModuleBase
 
 from giril_rl.experiments.report.game import Game
 from giril_rl.experiments.report.style import BLACK, BLUE, GREY, RED
-from giril_rl.runs.drawing import new_figure, save, thousands
+from giril_rl.runs.curve import new_figure, save, thousands
 
 
 @torch.no_grad()

@@ -19,7 +19,7 @@ from giril_rl.files.disk import read_json
 from giril_rl.policies.agent import load_agent
 from giril_rl.rewards import GenerativeReward
 from giril_rl.runs.finished import read_config, read_part, read_settings
-from giril_rl.runs.naming import safe
+from giril_rl.runs.identity import safe
 from giril_rl.runs.pretrained import CARD
 from giril_rl.training.demonstrations import find_demonstration
 from giril_rl.training.result import REWARD

@@ -12,7 +12,7 @@ import torch
 from tensordict import TensorDictBase
 
 from giril_rl.rewards import GenerativeReward
-from giril_rl.runs.drawing import new_figure, save
+from giril_rl.runs.curve import new_figure, save
 
 COLUMNS = ("s", "action", "predicted s'", "true s'", "squared error")
 # Inches: what is left of the frames, a frame, the action's name, a gap, what is below a frame.

@@ -23,9 +23,8 @@ from giril_rl.experiments.report.rows import Panel, panels_of
 from giril_rl.experiments.report.runs import RunRecord, Unfinished, read_runs
 from giril_rl.experiments.report.statistics import RESAMPLES, load_rliable
 from giril_rl.experiments.report.tables import Table, tables_of
-from giril_rl.files.disk import csv_text, write_atomically
-from giril_rl.files.places import check_place
-from giril_rl.runs.naming import safe
+from giril_rl.files.disk import check_place, csv_text, write_atomically
+from giril_rl.runs.identity import safe
 
 _RUN_COLUMNS = (
     "folder",

@@ -11,9 +11,8 @@ import yaml
 from giril_rl.config.leaves import flat
 from giril_rl.config.schema import is_atari
 from giril_rl.errors import UserError
-from giril_rl.files.formats import check_run_format
 from giril_rl.files.untrusted import parse_json, parse_yaml, read_text
-from giril_rl.runs.finished import read_result
+from giril_rl.runs.finished import check_run_format, read_result
 from giril_rl.runs.metrics import METRICS, read_metrics
 
 

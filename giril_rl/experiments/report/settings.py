@@ -13,7 +13,7 @@ from giril_rl.config.leaves import flat
 from giril_rl.errors import UserError
 from giril_rl.experiments.report.runs import RunRecord
 from giril_rl.experiments.report.style import TRUE_REWARD, is_own
-from giril_rl.runs.naming import NO_EFFECT
+from giril_rl.runs.identity import NO_EFFECT
 
 WITHOUT_PROFILE = frozenset(
     {"expert", TRUE_REWARD, "gail", "vail", "bc", "control:random", "control:held_action"}

@@ -1,4 +1,4 @@
-"""Training stops where a loss is no longer a number, rather than going on for hours."""
+"""Stops training as soon as a loss, a weight or an observation is NaN or infinite."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from giril_rl.errors import RunError
 
 
 class Finite:
-    """Looks at losses and weights before they are kept.
+    """Checks batches, losses and weights before they are used or saved.
 
     Args:
-        folder: the run's folder, for the sentence.
+        folder: the run's folder, for the message.
         total: steps of the whole training.
         unit: what a step is called.
 
@@ -34,26 +34,26 @@ class Finite:
         self.folder, self.total, self.unit = folder, total, unit
 
     def observations(self, batch: TensorDictBase, step: int) -> None:
-        """Raises RunError if what was observed is not finite, before anything learns from it.
+        """Raises RunError if an observation is NaN or infinite, before anything learns from it.
 
-        An infinity may be clipped on its way to a loss, and spoil running statistics for good.
+        A loss may not show it: an infinity can be clipped on the way, and yet spoil running
+        statistics for good.
         """
         seen = batch.select("observation", ("next", "observation"))
         found = first_not_finite(seen)
-        # After an action that is not finite any observation may come: the policy is to blame.
+        # A NaN action explains any observation after it: then the policy is to blame.
         if found is not None and first_not_finite(batch.select("action")) is None:
             raise self.error(found, step, "data")
 
     def losses(
         self, values: Mapping[str, float], step: int, batch: TensorDictBase | None = None
     ) -> None:
-        """Raises RunError if one of ``values`` is NaN or infinite at ``step``.
+        """Raises RunError if one of ``values`` is NaN or infinite.
 
         Args:
-            values: losses by their names.
-            step: the steps done.
-            batch: what they were computed from; if it has a number of the kind itself, that is
-                what the error names.
+            values: losses by name.
+            step: steps done.
+            batch: the data of these losses; if the NaN or infinity is in there, the error names it.
         """
         for name, value in values.items():
             if not math.isfinite(value):
@@ -63,9 +63,9 @@ class Finite:
                 raise self.error(f"{name} is {value}", step)
 
     def weights(self, module: nn.Module, step: int) -> None:
-        """Raises RunError if a parameter of the module is not finite, or a buffer has a NaN.
+        """Raises RunError if a parameter is NaN or infinite, or a buffer has a NaN.
 
-        Buffers are running statistics, but also bounds of actions, which may be infinite.
+        Infinite buffers are allowed: the bounds of an action may be.
         """
         for name, parameter in module.named_parameters():
             if not torch.isfinite(parameter).all():
@@ -75,7 +75,7 @@ class Finite:
                 raise self.error(f"{name} has statistics that are not numbers", step)
 
     def error(self, what: str, step: int, cause: str = "step size") -> RunError:
-        """What went wrong at ``step``, and what to do where ``cause`` is "step size" or "data"."""
+        """The error for ``step``; ``cause`` ("step size" or "data") decides what it advises."""
         remedy = (
             "give a smaller step size, or look at the rewards and observations"
             if cause == "step size"
@@ -88,11 +88,11 @@ class Finite:
 
 
 DATA = ("observation", "normalised", "action", ("next", "observation"), ("next", "reward"))
-"""What is looked at first, in this order, for the rest follows from it."""
+"""The keys to check, in this order, if a batch has any of them: the others follow from them."""
 
 
 def first_not_finite(batch: TensorDictBase) -> str | None:
-    """The first NaN or infinity of a batch and its place, None where all is finite.
+    """The first NaN or infinity in a batch, with its index; None if there is none.
 
     Examples:
         >>> from tensordict import TensorDict

@@ -4,12 +4,12 @@ import sys
 
 import pytest
 
-from giril_rl.runs.allocator import keep_freed_memory
+from giril_rl.runs.machine import keep_freed_memory
 
 CODE = """
 import resource, sys
 import torch
-from giril_rl.runs.allocator import keep_freed_memory
+from giril_rl.runs.machine import keep_freed_memory
 
 def faults():
     before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt

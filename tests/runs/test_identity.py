@@ -14,7 +14,7 @@ from giril_rl.config.schema import (
     RunConfig,
     TaskConfig,
 )
-from giril_rl.runs.naming import ADDED, NO_EFFECT, config_hash, variant, without_added
+from giril_rl.runs.identity import ADDED, NO_EFFECT, config_hash, variant, without_added
 
 TASK = TaskConfig("pole", "Pole-v0", None, 300_000, 990.0)
 

@@ -12,7 +12,7 @@ def test_short_work_without_a_terminal_is_silent():
 
 def test_lines_without_a_terminal_are_whole_and_count_from_the_start(monkeypatch):
     now = [0.0]
-    monkeypatch.setattr("giril_rl.runs.progress.time.monotonic", lambda: now[0])
+    monkeypatch.setattr("tqdm.std.time", lambda: now[0])
     log = io.StringIO()
     with progress(4000, 1000, "policy", stream=log) as bar:
         for _ in range(30):

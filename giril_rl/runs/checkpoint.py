@@ -1,11 +1,33 @@
-"""Nested training state to and from one safetensors file, exactly and without pickle."""
+"""Checkpoints: what a killed run restores, and the file that holds it.
+
+A loop passes one dictionary to :meth:`Run.save <giril_rl.runs.run.Run.save>` whenever it saves, and
+gets it back from :meth:`Run.load <giril_rl.runs.run.Run.load>` when the same command runs again.
+To continue bit for bit, the dictionary must hold everything that the next step reads:
+
+=====================  ===========================================================================
+progress               steps done, seconds so far, whether training stopped early
+modules                the state of policy, reward and transforms, with their running statistics
+optimizer              ``optimizer.state_dict()``
+random numbers         :func:`~giril_rl.runs.randomness.rng_state`, and the state of each generator
+                       that shuffles minibatches
+environments           the simulators' state and the unfinished episodes, where there are any
+=====================  ===========================================================================
+
+What a loop must do in return, in this order: put the state back inside :func:`restoring`, drop
+later rows of its phase with :meth:`Run.truncate_metrics
+<giril_rl.runs.run.Run.truncate_metrics>`, and save only what is finite (:class:`Finite
+<giril_rl.runs.finite_checks.Finite>`). ``tests/trust/test_kill.py`` kills runs at every write and
+compares the results.
+"""
 
 from __future__ import annotations
 
 import json
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -14,32 +36,65 @@ from torch import Tensor
 
 from giril_rl.errors import UserError
 from giril_rl.files.disk import write_atomically
-from giril_rl.files.formats import check_format
-from giril_rl.files.untrusted import parse_json
+from giril_rl.files.untrusted import check_format, parse_json
+
+if TYPE_CHECKING:
+    from giril_rl.runs.run import Run
 
 FORMAT_VERSION = "1"
 
 
-def save_state(path: Path | str, state: dict[str, Any]) -> None:
-    """Save nested training state to one safetensors file, replacing the previous one at once.
-
-    The tensors are the file's tensors; the nesting and all other values are JSON in its metadata.
-    Why not ``torch.save``: it pickles everything that is not a tensor, and its file is written in
-    place. Why not ``torchrl.checkpoint``: it writes a folder of several files, its formats for
-    optimiser state (integer keys, tuples, numbers) are ``torch.save`` again, and reading a
-    checkpoint that somebody sent must not be able to run code.
-
-    A kill at any moment leaves the previous file. Tensors keep dtype, shape and every bit; they are
-    stored contiguous, on the CPU, without gradient, and tensors that shared memory come back apart.
+@contextmanager
+def restoring(run: Run, phase: str) -> Iterator[None]:
+    """Report a checkpoint that does not fit what it is loaded into.
 
     Args:
-        path: the file, such as ``ppo.safetensors``; its folder is made if need be.
+        run: the run that the checkpoint belongs to.
+        phase: the checkpoint's name.
+
+    Raises:
+        UserError: in place of any error about names, sizes or types inside the ``with``.
+
+    Examples:
+        >>> from types import SimpleNamespace
+        >>> with restoring(SimpleNamespace(folder=Path("runs/a")), "ppo"):
+        ...     torch.nn.Linear(2, 1).load_state_dict({})
+        Traceback (most recent call last):
+        ...
+        giril_rl.errors.UserError: runs/a/ppo.safetensors cannot be restored (RuntimeError: ...
+    """
+    try:
+        yield
+    except torch.OutOfMemoryError:
+        raise  # A RuntimeError, but no reason to delete the checkpoint.
+    except (KeyError, IndexError, AttributeError, TypeError, ValueError, RuntimeError) as error:
+        reason = str(error).strip().partition("\n")[0]
+        raise UserError(
+            f"{run.folder / phase}.safetensors cannot be restored ({type(error).__name__}: "
+            f"{reason}): if it is a checkpoint of another run or task, delete the file to start "
+            "that part again, or restore a copy."
+        ) from error
+
+
+def save_state(path: Path | str, state: dict[str, Any]) -> None:
+    """Save nested training state as one safetensors file, atomically and without pickle.
+
+    The tensors are the file's tensors; the nesting and all other values are JSON in its metadata.
+    ``torch.save`` would pickle everything that is not a tensor, and writes in place.
+    ``torchrl.checkpoint`` writes a folder of files and uses ``torch.save`` for optimizer state. A
+    checkpoint from a stranger must not be able to run code.
+
+    Tensors keep dtype, shape and every bit. They are stored contiguous, on the CPU and without
+    gradient; tensors that shared memory come back separate.
+
+    Args:
+        path: the file, such as ``ppo.safetensors``; missing folders are made.
         state: dictionaries (keys str or int), lists and tuples of tensors, numbers, bools,
             strings and None, such as ``module.state_dict()``, ``optimizer.state_dict()`` or
             ``torch.get_rng_state()``.
 
     Raises:
-        TypeError: for any other value or key, naming where it is.
+        TypeError: for any other value or key, with its place in ``state``.
 
     Examples:
         >>> import tempfile
@@ -61,11 +116,8 @@ def save_state(path: Path | str, state: dict[str, Any]) -> None:
 def load_state(path: Path | str) -> dict[str, Any]:
     """Load what :func:`save_state` saved, with all tensors on the CPU.
 
-    Args:
-        path: the file.
-
     Raises:
-        UserError: if the file is missing, damaged or of another format.
+        UserError: if the file is missing, damaged or has another format.
 
     Examples:
         >>> load_state("no/such/file.safetensors")
@@ -109,7 +161,7 @@ def _damaged(path: Path, reason: str) -> UserError:
 
 
 def _checksum(structure: str, tensors: dict[str, Tensor]) -> str:
-    # safetensors notices a wrong length but not a flipped bit.
+    # safetensors detects a wrong length but not a flipped bit.
     total = zlib.crc32(structure.encode())
     for name in sorted(tensors):
         flat = tensors[name].reshape(-1)
@@ -118,9 +170,9 @@ def _checksum(structure: str, tensors: dict[str, Tensor]) -> str:
 
 
 def _describe(value: Any, name: str, tensors: dict[str, Tensor]) -> Any:
-    """JSON for ``value``: a scalar is itself, all else a one-entry object naming its kind."""
+    """``value`` as JSON: scalars as they are, anything else as ``{kind: content}``."""
     if isinstance(value, Tensor):
-        # The number keeps apart the keys 0 and "0", and the key "a.b" and nested a, b.
+        # The number separates the keys 0 and "0", and the key "a.b" from nested a, b.
         unique = f"{len(tensors)}:{name}"
         plain = value.detach().cpu().resolve_conj().resolve_neg()
         tensors[unique] = plain.clone(memory_format=torch.contiguous_format)

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from short_runs import TINY
 
 from giril_rl.cli.command_line import main
 from giril_rl.experiments.study.plan import Planner
@@ -16,7 +17,7 @@ RECIPE = '''"""Fake: a run without work."""
 from dataclasses import asdict, dataclass
 
 from giril_rl.config.schema import RunConfig, knob
-from giril_rl.runs.naming import config_hash
+from giril_rl.runs.identity import config_hash
 from giril_rl.training import Run
 
 SCORES = ("return_mean", "return_std", "return_median", "episode_length_mean")
@@ -39,8 +40,6 @@ def main(cfg, out):
         run.finish(about)
 '''
 SETTINGS = "defaults: [recipe_schema, {task: inverted_pendulum}, _self_]\nsteps: 2000\n"
-TINY = ["ppo.num_envs=2", "ppo.rollout=8", "ppo.minibatch=8", "ppo.epochs=1", "ppo.hidden=[4]"]
-TINY += ["logger=null", "task.env_id=StepCounter-v0", "out=o"]
 
 
 @pytest.fixture
@@ -108,7 +107,7 @@ def test_an_unfinished_run_goes_on_with_other_settings_of_watching(fake):
 
 def test_a_finished_policy_is_scored_anew_and_not_trained(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    words = ["run", "control", *TINY, "eval.episodes=2"]
+    words = ["run", "control", *TINY, "task.env_id=StepCounter-v0", "out=o", "eval.episodes=2"]
     error = told(capsys, *words, "steps=17")
     assert error == "giril: steps=17 is no multiple of a batch (2 * 8 = 16): 32 steps are taken.\n"
     before = json.loads(Path("o/result.json").read_text())

@@ -10,7 +10,8 @@ import torch
 import yaml
 
 from giril_rl.errors import UserError
-from giril_rl.runs.metrics import check_logger, read_metrics
+from giril_rl.runs.loggers import check_logger
+from giril_rl.runs.metrics import read_metrics
 from giril_rl.runs.run import Run
 
 CONFIG = {"seed": 0, "out": "a", "ppo": {"lr": 3e-4, "hidden": [100, 100], "clip": 0.1}}

@@ -5,13 +5,14 @@ import signal
 import subprocess
 import sys
 import time
+from types import SimpleNamespace
 
 import pytest
 import torch
 from safetensors.torch import save_file
 
 from giril_rl.errors import UserError
-from giril_rl.files.checkpoint import load_state, save_state
+from giril_rl.runs.checkpoint import load_state, restoring, save_state
 
 
 def same(left, right):
@@ -157,7 +158,7 @@ def test_unknown_format_version_and_foreign_file_are_refused(tmp_path):
 
 SAVER = """
 import sys, torch
-from giril_rl.files.checkpoint import save_state
+from giril_rl.runs.checkpoint import save_state
 torch.set_num_threads(1)
 for step in range(10**9):
     save_state(sys.argv[1], {"step": step, "x": torch.full((200_000,), float(step))})
@@ -168,7 +169,7 @@ for step in range(10**9):
 
 def test_a_kill_at_any_moment_leaves_a_whole_checkpoint(tmp_path):
     path = tmp_path / "a.safetensors"
-    for round_ in range(4):
+    for round_ in range(2):
         process = subprocess.Popen(
             [sys.executable, "-c", SAVER, str(path)], stdout=subprocess.PIPE, text=True
         )
@@ -180,3 +181,20 @@ def test_a_kill_at_any_moment_leaves_a_whole_checkpoint(tmp_path):
         process.stdout.close()
         state = load_state(path)
         assert (state["x"] == state["step"]).all()
+
+
+@pytest.mark.parametrize("error", [KeyError("step"), RuntimeError("size mismatch")])
+def test_a_checkpoint_that_does_not_fit_is_named(error, tmp_path):
+    with (
+        pytest.raises(UserError, match=r"ppo\.safetensors cannot be restored \(\w+: .*\): if it"),
+        restoring(SimpleNamespace(folder=tmp_path), "ppo"),
+    ):
+        raise error
+
+
+def test_too_little_memory_is_not_the_checkpoints_fault(tmp_path):
+    with (
+        pytest.raises(torch.OutOfMemoryError, match="tried to allocate"),
+        restoring(SimpleNamespace(folder=tmp_path), "ppo"),
+    ):
+        raise torch.OutOfMemoryError("tried to allocate 2 GiB")
