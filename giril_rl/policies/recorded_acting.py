@@ -8,7 +8,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor, nn
 
-from giril_rl.graphs.recorded import CannotRecord, record
+from giril_rl.graphs import CannotRecord, record
 from giril_rl.policies.acting import ActingPolicy
 from giril_rl.policies.agents import Agent
 from giril_rl.policies.policy import ActorCritic

@@ -11,7 +11,7 @@ from torch import nn
 from torchrl.objectives import LossModule
 
 from giril_rl.config.schema import FitConfig
-from giril_rl.graphs.traced import TracedGradients
+from giril_rl.graphs import TracedGradients
 from giril_rl.rewards.chunks import PIXELS_AT_ONCE
 from giril_rl.runs.finite import Finite
 from giril_rl.runs.interrupt import Interrupt, Interrupted

@@ -20,7 +20,7 @@ from torchrl.objectives.value import GAE
 from giril_rl.config.schema import PPOConfig
 from giril_rl.envs import BatchedEnv
 from giril_rl.errors import UserError
-from giril_rl.graphs.traced import TracedGradients
+from giril_rl.graphs import TracedGradients
 from giril_rl.policies.agents import Agent, check_actions
 from giril_rl.policies.recorded_acting import collecting
 from giril_rl.runs.finite import Finite

@@ -22,7 +22,7 @@ from torchrl.objectives import ClipPPOLoss
 
 from giril_rl.config.schema import TaskConfig
 from giril_rl.envs import gym_factory, make_env
-from giril_rl.graphs.traced import TracedGradients
+from giril_rl.graphs import TracedGradients
 from giril_rl.networks.distributions import DiagonalGaussian
 from giril_rl.policies.policy import NORMALISED, ActorCritic
 from giril_rl.policies.recorded_acting import RecordedActing

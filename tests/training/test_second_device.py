@@ -11,8 +11,8 @@ from torchrl.envs import Compose
 from torchrl.objectives.value import GAE
 
 from giril_rl.config.schema import AdversarialConfig, PPOConfig
-from giril_rl.graphs.recorded import record
-from giril_rl.graphs.traced import TracedGradients
+from giril_rl.graphs import record
+from giril_rl.graphs import TracedGradients
 from giril_rl.policies.pixel_policy import PixelActorCritic
 from giril_rl.policies.policy import ActorCritic
 from giril_rl.rewards import (

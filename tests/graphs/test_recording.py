@@ -12,7 +12,7 @@ from torch import nn
 from torch.nn.utils.parametrizations import spectral_norm
 from torchrl.data import Bounded
 
-from giril_rl.graphs.traced import TracedGradients
+from giril_rl.graphs import TracedGradients
 from giril_rl.policies.policy import ActorCritic
 from giril_rl.policies.recorded_acting import RecordedActing
 
@@ -168,7 +168,7 @@ def test_an_annealed_coefficient_is_heeded():
 
 
 def test_endless_kinds_of_batches_are_not_all_kept(monkeypatch):
-    monkeypatch.setattr("giril_rl.graphs.traced._MOST_GRAPHS", 2)
+    monkeypatch.setattr("giril_rl.graphs.recording._MOST_GRAPHS", 2)
     with pytest.warns(UserWarning, match="more than 2 kinds"):
         assert_as_eager(Loss(body()()), change=nn.Module.eval)
 
