@@ -110,9 +110,9 @@ class TracedGradients:
                 materialize_grads=True,
             )
         if self._max_grad_norm is not None:
-            norm = torch.linalg.vector_norm(torch.stack(torch._foreach_norm(gradients)))
-            factor = self._max_grad_norm / (norm + 1e-6)
-            gradients = torch._foreach_mul(gradients, factor.clamp(max=1.0))
+            norm = torch.nn.utils.get_total_norm(gradients)
+            factor = (self._max_grad_norm / (norm + 1e-6)).clamp(max=1.0)
+            gradients = [gradient * factor for gradient in gradients]
         return {
             **dict(zip(self._names, gradients, strict=True)),
             **{k: v.detach() for k, v in losses.items()},

@@ -216,7 +216,8 @@ def record(
                 candidates = [*_in_torchscript(graph, inputs), graph]
         for candidate in candidates:
             with _restored(inputs):
-                same = _same(_outcome(candidate, inputs), expected)
+                found = _outcome(candidate, inputs)
+            same = all(_equal(one, other) for one, other in zip(found, expected, strict=True))
             if same:
                 return compiled(candidate, device) if compile else candidate
     raise CannotRecord("recorded, it gives other numbers or draws other random ones")
@@ -266,15 +267,11 @@ def _size_depends_on_values(node: fx.Node) -> bool:
     return torch.bool in chosen or torch.uint8 in chosen
 
 
-def _outcome(function: Function, inputs: Sequence[Tensor]) -> list[list[Tensor]]:
+def _outcome(function: Function, inputs: Sequence[Tensor]) -> list[Tensor]:
     """A call's results, and what it leaves behind: its inputs and the random state."""
-    results = list(function(*inputs))
-    return [results, [x.clone() for x in inputs], list(rng_state(inputs[0].device).values())]
-
-
-def _same(found: list[list[Tensor]], expected: list[list[Tensor]]) -> bool:
-    pairs = zip(sum(found, []), sum(expected, []), strict=True)
-    return all(_equal(one, other) for one, other in pairs)
+    results = function(*inputs)
+    left = [x.clone() for x in inputs]
+    return [*results, *left, *rng_state(inputs[0].device).values()]
 
 
 def _equal(one: Tensor, other: Tensor) -> bool:

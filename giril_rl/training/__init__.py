@@ -1,6 +1,6 @@
 """The loops that recipes share: fit a reward, PPO on a reward, score, keep and resume."""
 
-from giril_rl.policies.agent import load_agent, make_agent
+from giril_rl.policies import load_agent, make_agent
 from giril_rl.runs.run import Run
 from giril_rl.training.adversarial import AdversarialLearner
 from giril_rl.training.clone import clone_behaviour

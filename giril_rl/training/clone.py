@@ -15,8 +15,7 @@ from torchrl.objectives import BCLoss
 from giril_rl.config.schema import BCConfig
 from giril_rl.errors import UserError
 from giril_rl.networks.normalise import RunningNormaliser
-from giril_rl.policies.agents import Agent
-from giril_rl.policies.policy import NORMALISED
+from giril_rl.policies import NORMALISED, PPOAgent
 from giril_rl.rewards.chunks import PIXELS_AT_ONCE
 from giril_rl.runs.finite import Finite
 from giril_rl.runs.interrupt import Interrupt, Interrupted
@@ -32,7 +31,7 @@ CHECKPOINT_EVERY = 1_000
 
 
 def clone_behaviour(
-    agent: Agent,
+    agent: PPOAgent,
     fitted: TensorDictBase,
     cfg: BCConfig,
     *,
@@ -144,7 +143,7 @@ def clone_behaviour(
 
 
 @torch.no_grad()
-def set_deviation(agent: Agent, pairs: TensorDictBase, least: float) -> None:
+def set_deviation(agent: PPOAgent, pairs: TensorDictBase, least: float) -> None:
     """Gives Box actions the deviation that makes ``pairs`` likeliest, one for each dimension.
 
     Args:
@@ -154,7 +153,7 @@ def set_deviation(agent: Agent, pairs: TensorDictBase, least: float) -> None:
 
     Examples:
         >>> from torchrl.data import Bounded
-        >>> from giril_rl.policies.policy import ActorCritic
+        >>> from giril_rl.policies import ActorCritic
         >>> agent = ActorCritic(1, Bounded(-1, 1, shape=(1,)), hidden=())
         >>> agent.actor[-1].weight.data.fill_(1.0)
         tensor([[1.]])
@@ -170,7 +169,7 @@ def set_deviation(agent: Agent, pairs: TensorDictBase, least: float) -> None:
     agent.log_std.copy_(error.square().mean(0).sqrt().clamp(min=least).log())
 
 
-def _loss(agent: Agent) -> BCLoss:
+def _loss(agent: PPOAgent) -> BCLoss:
     """TorchRL's loss on what the network puts out: the mean action, or the actions' logits."""
     actor = TensorDictModule(agent.actor, in_keys=[NORMALISED], out_keys=["action"])
     with warnings.catch_warnings():
@@ -178,7 +177,7 @@ def _loss(agent: Agent) -> BCLoss:
         return BCLoss(actor, loss_function="cross_entropy" if agent.discrete else "mse")
 
 
-def _pairs(agent: Agent, data: TensorDictBase) -> TensorDict:
+def _pairs(agent: PPOAgent, data: TensorDictBase) -> TensorDict:
     """Normalised observations and what the actor's output is fitted to."""
     data = data.to(agent.device)
     normalised = agent.normaliser(data.get("observation"))

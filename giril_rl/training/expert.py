@@ -27,8 +27,7 @@ from giril_rl.demos.task import as_recorded_task, check_environment, spaces_of
 from giril_rl.envs import gym_factory, make_env, with_own_episodes
 from giril_rl.errors import UserError
 from giril_rl.files.disk import missing, remove_empty, remove_leftovers
-from giril_rl.policies.agent import load_agent, make_agent
-from giril_rl.policies.agents import Agent
+from giril_rl.policies import Agent, load_agent, make_agent
 from giril_rl.runs.finished import read_result
 from giril_rl.runs.naming import NO_EFFECT, out_folder, safe, without_added
 from giril_rl.runs.randomness import check_device

@@ -21,8 +21,7 @@ from giril_rl.config.schema import PPOConfig
 from giril_rl.envs import BatchedEnv
 from giril_rl.errors import UserError
 from giril_rl.graphs import TracedGradients
-from giril_rl.policies.agents import Agent, check_actions
-from giril_rl.policies.recorded_acting import collecting
+from giril_rl.policies import PPOAgent, check_actions, collecting
 from giril_rl.runs.finite import Finite
 from giril_rl.runs.interrupt import Interrupt, Interrupted
 from giril_rl.runs.progress import progress
@@ -79,7 +78,7 @@ def _closing_env(
 @_closing_env
 def train_ppo(
     env: BatchedEnv,
-    agent: Agent,
+    agent: PPOAgent,
     relabel: nn.Module,
     cfg: PPOConfig,
     *,
@@ -266,7 +265,7 @@ class PPOLearner:
     """
 
     def __init__(
-        self, agent: Agent, cfg: PPOConfig, *, total_steps: int, termination: str = "ends"
+        self, agent: PPOAgent, cfg: PPOConfig, *, total_steps: int, termination: str = "ends"
     ) -> None:
         if termination not in ("ends", "bootstrap"):
             raise UserError(f"termination={termination}: choose one of ends, bootstrap.")

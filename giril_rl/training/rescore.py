@@ -15,7 +15,7 @@ from giril_rl.config.schema import EvalConfig, TaskConfig
 from giril_rl.errors import UserError
 from giril_rl.files.disk import write_atomically, write_json
 from giril_rl.files.places import check_place
-from giril_rl.policies.agent import load_agent
+from giril_rl.policies import load_agent
 from giril_rl.runs.finished import (
     print_both,
     read_config,

@@ -12,8 +12,7 @@ from giril_rl.config.schema import ControlRunConfig, DemoConfig, RunConfig, Unav
 from giril_rl.demos import Demonstration
 from giril_rl.demos.shipped import demonstration_name
 from giril_rl.files.disk import processor
-from giril_rl.policies.agent import POLICY
-from giril_rl.policies.agents import Agent
+from giril_rl.policies import POLICY, Agent
 from giril_rl.runs.curve import write_curve
 from giril_rl.runs.losses import loss_points, write_losses
 from giril_rl.runs.metrics import METRICS, read_metrics

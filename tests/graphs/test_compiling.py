@@ -14,8 +14,7 @@ from torch import nn
 from torch._dynamo.exc import TorchDynamoException
 
 from giril_rl.errors import RunError
-from giril_rl.graphs import compiled
-from giril_rl.graphs import TracedGradients
+from giril_rl.graphs import TracedGradients, compiled
 from giril_rl.rewards import BottleneckLoss
 
 ROWS = 6

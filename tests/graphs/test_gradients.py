@@ -8,7 +8,7 @@ from torchrl.data import Bounded, Categorical
 from torchrl.objectives import ClipPPOLoss
 
 from giril_rl.graphs import TracedGradients
-from giril_rl.policies.policy import NORMALISED, ActorCritic
+from giril_rl.policies import NORMALISED, ActorCritic
 from giril_rl.rewards import GenerativeReward, GenerativeRewardLoss
 from giril_rl.training.ppo import LEARNER_KEYS, RecordableClipPPOLoss
 

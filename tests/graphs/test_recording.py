@@ -13,8 +13,7 @@ from torch.nn.utils.parametrizations import spectral_norm
 from torchrl.data import Bounded
 
 from giril_rl.graphs import TracedGradients
-from giril_rl.policies.policy import ActorCritic
-from giril_rl.policies.recorded_acting import RecordedActing
+from giril_rl.policies import ActorCritic, RecordedActing
 
 
 class Loss(nn.Module):

@@ -14,9 +14,7 @@ from giril_rl.config.schema import PPOConfig, TaskConfig
 from giril_rl.envs import GymVectorEnv, make_env
 from giril_rl.errors import UserError
 from giril_rl.files.checkpoint import load_state
-from giril_rl.policies.agent import make_agent
-from giril_rl.policies.pixel_policy import PixelActorCritic
-from giril_rl.policies.policy import NORMALISED, ActorCritic
+from giril_rl.policies import NORMALISED, ActorCritic, PixelActorCritic, make_agent
 from giril_rl.rewards import GenerativeReward
 from giril_rl.runs.interrupt import Interrupted
 from giril_rl.runs.metrics import read_metrics

@@ -15,7 +15,7 @@ from giril_rl.errors import UserError
 from giril_rl.files.checkpoint import load_state
 from giril_rl.files.disk import read_json, write_json
 from giril_rl.files.formats import check_format
-from giril_rl.policies.agents import load_agent_from
+from giril_rl.policies import load_agent_from
 from giril_rl.rewards import GenerativeReward
 
 LOGITS = [0.6002023, -0.7985780, 0.0336854, -0.2988219]
