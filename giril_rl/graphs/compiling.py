@@ -29,11 +29,6 @@ def compiled(
     Raises:
         RunError: at the first call, if this machine cannot compile, for example without a C++
             compiler.
-
-    Examples:
-        >>> double = compiled(lambda x: (x + x,), torch.device("cpu"))
-        >>> double(torch.tensor([1.0, 3.0]))  # doctest: +SKIP
-        (tensor([2., 6.]),)
     """
     on_gpu = device.type == "cuda"
     function = torch.compile(
