@@ -159,6 +159,14 @@ def test_what_no_graph_can_do_runs_as_it_is_and_says_so_once(name):
     assert len([warning for warning in said if "recorded" in str(warning.message)]) == 1
 
 
+@pytest.mark.parametrize("name", ["dropout", "batch norm"])
+def test_without_torchscript_the_bits_are_the_same(name, monkeypatch):
+    monkeypatch.delattr(torch.jit, "trace")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert_as_eager(Loss(RECORDED[name]()), change=nn.Module.eval)
+
+
 def test_an_annealed_coefficient_is_heeded():
     def anneal(loss):
         loss.alpha = 0.25
