@@ -12,10 +12,10 @@ from types import ModuleType
 
 MOVED = {
     "configs": "config.schema",
-    "networks.acting": "policies.acting",
-    "networks.agents": "policies.agents",
-    "networks.pixel_policy": "policies.pixel_policy",
-    "networks.policy": "policies.policy",
+    "networks.acting": "policies.agent",
+    "networks.agents": "policies.making",
+    "networks.pixel_policy": "policies.pixel_actor_critic",
+    "networks.policy": "policies.actor_critic",
     "pretrained": "runs.pretrained",
     "training.checkpoint": "runs.checkpoint",
     "training.run": "runs.run",

@@ -7,8 +7,8 @@ from tensordict import TensorDict
 from torchrl.data import Categorical
 
 from giril_rl.config.schema import PPOConfig
-from giril_rl.graphs.traced import TracedGradients
-from giril_rl.policies.pixel_policy import PixelActorCritic
+from giril_rl.graphs import TracedGradients
+from giril_rl.policies import PixelActorCritic
 from giril_rl.rewards import (
     BottleneckLoss,
     BottleneckReward,

@@ -1,6 +1,6 @@
 """What recipes compose: a demonstration, reward training, the training loop, scores."""
 
-from giril_rl.policies.agent import load_agent, make_agent
+from giril_rl.policies import load_agent, make_agent
 from giril_rl.runs.run import Run
 from giril_rl.training.algorithm import Algorithm
 from giril_rl.training.baselines import (

@@ -7,7 +7,7 @@ from typing import Any, Protocol
 
 from tensordict import TensorDictBase
 
-from giril_rl.policies.agents import Agent
+from giril_rl.policies.agent import Agent
 
 
 class Algorithm(Protocol):
@@ -16,18 +16,21 @@ class Algorithm(Protocol):
     The loop collects, relabels, logs, checkpoints and resumes; an algorithm only acts and learns.
 
     Attributes:
-        agent: the policy and its critics. They decide the device of learning.
         num_envs: parallel environments.
         frames_per_batch: transitions that are collected between two updates.
         steps: environment steps of the whole training, in whole batches.
         checkpoint_every: environment steps between checkpoints.
     """
 
-    agent: Agent
     num_envs: int
     frames_per_batch: int
     steps: int
     checkpoint_every: int
+
+    @property
+    def agent(self) -> Agent:
+        """The policy and its critics. They decide the device of learning."""
+        ...
 
     def act(self) -> Callable[[TensorDictBase], TensorDictBase]:
         """The policy that collects, for TorchRL's collector."""

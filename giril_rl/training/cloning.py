@@ -14,8 +14,7 @@ from torchrl.objectives import BCLoss
 from giril_rl.config.schema import BCConfig
 from giril_rl.errors import UserError
 from giril_rl.networks.normalise import RunningNormaliser
-from giril_rl.policies.agents import Agent
-from giril_rl.policies.policy import NORMALISED
+from giril_rl.policies import NORMALISED, PPOAgent
 from giril_rl.rewards.chunks import PIXELS_AT_ONCE
 from giril_rl.rewards.method import ORANGE, Method, register
 from giril_rl.runs.randomness import stream_seed
@@ -30,7 +29,7 @@ register(Method("bc", "BC", ORANGE, settings=BCConfig, rank=4))
 
 
 def clone_behaviour(
-    agent: Agent,
+    agent: PPOAgent,
     data: TensorDictBase,
     cfg: BCConfig,
     *,
@@ -101,7 +100,7 @@ class _Cloning:
 
     def __init__(
         self,
-        agent: Agent,
+        agent: PPOAgent,
         data: TensorDictBase,
         cfg: BCConfig,
         seed: int,
@@ -153,7 +152,7 @@ class _Cloning:
 
 
 @torch.no_grad()
-def set_std(agent: Agent, pairs: TensorDictBase, least: float) -> None:
+def set_std(agent: PPOAgent, pairs: TensorDictBase, least: float) -> None:
     """Sets the standard deviation of Box actions to its maximum likelihood, per dimension.
 
     Args:
@@ -163,7 +162,7 @@ def set_std(agent: Agent, pairs: TensorDictBase, least: float) -> None:
 
     Examples:
         >>> from torchrl.data import Bounded
-        >>> from giril_rl.policies.policy import ActorCritic
+        >>> from giril_rl.policies import ActorCritic
         >>> agent = ActorCritic(1, Bounded(-1, 1, shape=(1,)), hidden=())
         >>> agent.actor[-1].weight.data.fill_(1.0)
         tensor([[1.]])
@@ -179,7 +178,7 @@ def set_std(agent: Agent, pairs: TensorDictBase, least: float) -> None:
     agent.log_std.copy_(error.square().mean(0).sqrt().clamp(min=least).log())
 
 
-def _loss(agent: Agent) -> BCLoss:
+def _loss(agent: PPOAgent) -> BCLoss:
     """TorchRL's loss on what the network puts out: the mean action, or the actions' logits."""
     actor = TensorDictModule(agent.actor, in_keys=[NORMALISED], out_keys=["action"])
     with warnings.catch_warnings():
@@ -187,7 +186,7 @@ def _loss(agent: Agent) -> BCLoss:
         return BCLoss(actor, loss_function="cross_entropy" if agent.discrete else "mse")
 
 
-def _pairs(agent: Agent, data: TensorDictBase) -> TensorDict:
+def _pairs(agent: PPOAgent, data: TensorDictBase) -> TensorDict:
     """Normalised observations and what the actor's output is fitted to."""
     data = data.to(agent.device)
     normalised = agent.normaliser(data.get("observation"))

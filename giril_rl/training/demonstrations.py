@@ -21,8 +21,8 @@ from giril_rl.demos.task import as_recorded_task, check_environment, spaces_of
 from giril_rl.envs import gym_factory
 from giril_rl.errors import UserError
 from giril_rl.files.disk import remove_leftovers
-from giril_rl.policies.agent import load_agent
-from giril_rl.policies.agents import Agent
+from giril_rl.policies.agent import Agent
+from giril_rl.policies.making import load_agent
 from giril_rl.runs.finished import read_config, read_part, read_result
 from giril_rl.runs.identity import NO_EFFECT, config_hash, out_folder, safe, without_added
 from giril_rl.runs.run import Run

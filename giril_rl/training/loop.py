@@ -16,7 +16,7 @@ from torch import nn
 from torchrl.collectors import Collector
 
 from giril_rl.envs import BatchedEnv
-from giril_rl.policies.agents import check_actions
+from giril_rl.policies.making import check_actions
 from giril_rl.runs.checkpoint import restoring
 from giril_rl.runs.finite_checks import Finite
 from giril_rl.runs.interrupt import Interrupt, Interrupted

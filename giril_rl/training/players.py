@@ -18,7 +18,7 @@ from giril_rl.config.task_defaults import apply_task_defaults
 from giril_rl.envs import gym_factory, make_env, with_own_episodes
 from giril_rl.errors import UserError
 from giril_rl.files.disk import missing, remove_empty
-from giril_rl.policies.agent import make_agent
+from giril_rl.policies.making import make_agent
 from giril_rl.runs.finished import read_result
 from giril_rl.runs.identity import out_folder
 from giril_rl.runs.machine import check_device

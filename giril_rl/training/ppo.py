@@ -13,10 +13,8 @@ from torchrl.objectives.value import GAE
 
 from giril_rl.config.schema import PPOConfig, ScalingConfig
 from giril_rl.errors import UserError
-from giril_rl.graphs.traced import TracedGradients
-from giril_rl.policies.acting import ActingPolicy
-from giril_rl.policies.agents import Agent
-from giril_rl.policies.recorded_acting import collecting
+from giril_rl.graphs.gradients import TracedGradients
+from giril_rl.policies import ActingPolicy, PPOAgent, collecting
 from giril_rl.transforms.scaling import ResetRule, ReturnScaling
 
 LOSS_KEYS = ("action_log_prob", "advantage", "value_target")
@@ -42,7 +40,7 @@ class PPO:
     Examples:
         >>> from tensordict import TensorDict
         >>> from torchrl.data import Bounded
-        >>> from giril_rl.policies.policy import ActorCritic
+        >>> from giril_rl.policies import ActorCritic
         >>> agent = ActorCritic(3, Bounded(-1, 1, shape=(1,)))
         >>> ppo = PPO(agent, PPOConfig(num_envs=2, rollout=4, minibatch=8), steps=100)
         >>> ppo.steps  # 13 batches of 8
@@ -64,7 +62,7 @@ class PPO:
     """
 
     def __init__(
-        self, agent: Agent, cfg: PPOConfig, *, steps: int, termination: str = "ends"
+        self, agent: PPOAgent, cfg: PPOConfig, *, steps: int, termination: str = "ends"
     ) -> None:
         if termination not in ("ends", "bootstrap"):
             raise UserError(f"termination={termination}: choose one of ends, bootstrap.")

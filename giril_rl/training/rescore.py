@@ -14,7 +14,7 @@ from giril_rl.config.imports import named_modules
 from giril_rl.config.schema import EvalConfig, TaskConfig
 from giril_rl.errors import UserError
 from giril_rl.files.disk import check_place, write_atomically, write_json
-from giril_rl.policies.agent import load_agent
+from giril_rl.policies.making import load_agent
 from giril_rl.runs.finished import (
     print_both,
     read_config,

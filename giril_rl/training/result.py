@@ -10,8 +10,8 @@ from torch import nn
 from giril_rl.config.schema import AveragedRunConfig, DemoConfig, RunConfig
 from giril_rl.demos import Demonstration
 from giril_rl.demos.shipped import demonstration_name
-from giril_rl.policies.agent import POLICY
-from giril_rl.policies.agents import Agent
+from giril_rl.policies.agent import Agent
+from giril_rl.policies.making import POLICY
 from giril_rl.runs.curve import loss_points, write_curve, write_losses
 from giril_rl.runs.identity import config_hash
 from giril_rl.runs.machine import processor

@@ -14,7 +14,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from giril_rl.config.schema import TaskConfig
 from giril_rl.envs import BatchedEnv, for_scores, make_env
-from giril_rl.policies.agents import check_actions
+from giril_rl.policies import check_actions
 from giril_rl.runs.progress import progress
 from giril_rl.runs.randomness import Use, seeded, stream_seed
 
@@ -23,7 +23,7 @@ EPISODES_AT_ONCE = 20
 
 
 class Player(Protocol):
-    """Whatever can be scored, such as :class:`~giril_rl.policies.policy.ActorCritic`."""
+    """Whatever can be scored, such as :class:`~giril_rl.policies.ActorCritic`."""
 
     def acting(self) -> Callable[[TensorDictBase], TensorDictBase]:
         """What writes ``"action"`` for a batch of ``"observation"``."""
@@ -85,7 +85,7 @@ def evaluate(
         UserError: if the agent was made for other actions than the task's.
 
     Examples:
-        >>> from giril_rl.policies.policy import ActorCritic
+        >>> from giril_rl.policies import ActorCritic
         >>> task = TaskConfig(name="cartpole", env_id="CartPole-v1")
         >>> env = make_env(task, num_envs=1, seed=0)
         >>> scores = evaluate(

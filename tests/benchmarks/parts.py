@@ -22,10 +22,9 @@ from torchrl.objectives import ClipPPOLoss
 
 from giril_rl.config.schema import TaskConfig
 from giril_rl.envs import gym_factory, make_env
-from giril_rl.graphs.traced import TracedGradients
+from giril_rl.graphs import TracedGradients
 from giril_rl.networks.distributions import DiagonalGaussian
-from giril_rl.policies.policy import NORMALISED, ActorCritic
-from giril_rl.policies.recorded_acting import RecordedActing
+from giril_rl.policies import NORMALISED, ActorCritic, RecordedActing
 from giril_rl.training.ppo import LOSS_KEYS
 
 TASK = TaskConfig(name="inverted_pendulum", env_id="InvertedPendulumBulletEnv-v0")

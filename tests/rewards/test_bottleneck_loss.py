@@ -8,7 +8,7 @@ from torch.distributions import Independent, Normal, kl_divergence
 from torchrl.data import Bounded, Categorical
 
 from giril_rl.errors import UserError
-from giril_rl.graphs.traced import TracedGradients
+from giril_rl.graphs import TracedGradients
 from giril_rl.rewards import BottleneckLoss, BottleneckReward
 
 SPECS = {"box": Bounded(-1.0, 1.0, shape=(2,)), "discrete": Categorical(4)}

@@ -6,7 +6,7 @@ from torch import nn
 from torchrl.data import Bounded, Categorical, OneHot
 
 from giril_rl.errors import UserError
-from giril_rl.graphs.traced import TracedGradients
+from giril_rl.graphs import TracedGradients
 from giril_rl.rewards import (
     ActionEncoder,
     CuriosityReward,

@@ -8,7 +8,7 @@ from torchrl.data import Bounded, Categorical, OneHot
 from torchrl.objectives import GAILLoss
 
 from giril_rl.errors import UserError
-from giril_rl.graphs.traced import TracedGradients
+from giril_rl.graphs import TracedGradients
 from giril_rl.rewards import (
     BottleneckLoss,
     BottleneckReward,

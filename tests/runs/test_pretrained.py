@@ -8,9 +8,7 @@ from torch import nn
 from torchrl.data import Bounded, Categorical, OneHot, Unbounded
 
 from giril_rl.errors import UserError
-from giril_rl.policies.agents import load_agent_from
-from giril_rl.policies.pixel_policy import PixelActorCritic
-from giril_rl.policies.policy import ActorCritic
+from giril_rl.policies import ActorCritic, PixelActorCritic, load_agent_from
 from giril_rl.rewards import (
     BottleneckReward,
     CuriosityReward,

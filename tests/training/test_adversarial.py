@@ -10,7 +10,7 @@ from torchrl.envs import Compose
 
 from giril_rl.config.schema import AdversarialConfig, PPOConfig
 from giril_rl.envs import GymVectorEnv
-from giril_rl.policies.agent import make_agent
+from giril_rl.policies.making import make_agent
 from giril_rl.rewards import (
     BottleneckLoss,
     BottleneckReward,

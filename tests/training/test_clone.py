@@ -8,7 +8,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from giril_rl.config.schema import BCConfig
 from giril_rl.errors import UserError
-from giril_rl.policies.policy import NORMALISED, ActorCritic
+from giril_rl.policies.actor_critic import NORMALISED, ActorCritic
 from giril_rl.runs.checkpoint import load_state
 from giril_rl.runs.interrupt import Interrupted
 from giril_rl.runs.metrics import read_metrics

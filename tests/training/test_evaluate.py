@@ -8,7 +8,7 @@ import torch
 
 from giril_rl.config.schema import TaskConfig
 from giril_rl.envs import make_env
-from giril_rl.policies.policy import ActorCritic
+from giril_rl.policies.actor_critic import ActorCritic
 from giril_rl.runs.randomness import stream_seed
 from giril_rl.training.scoring import EPISODES_AT_ONCE, evaluate, evaluate_both
 
@@ -133,7 +133,7 @@ def test_a_thousand_episodes_of_pybullet_fit_into_memory():
         "import resource, torch\n"
         "from giril_rl.config.schema import TaskConfig\n"
         "from giril_rl.envs import make_env\n"
-        "from giril_rl.policies.policy import ActorCritic\n"
+        "from giril_rl.policies import ActorCritic\n"
         "from giril_rl.training.scoring import evaluate\n"
         "task = TaskConfig(name='pendulum', env_id='InvertedPendulumBulletEnv-v0')\n"
         "env = make_env(task, 1, seed=0)\n"

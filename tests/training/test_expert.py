@@ -92,7 +92,9 @@ def test_a_given_demonstration_must_fit_the_task(obtain, tmp_path):
 def test_a_demonstration_is_recorded_once(obtain, monkeypatch):
     pytest.importorskip("ale_py")
     first, _ = obtain(BREAKOUT, LIFE)
-    monkeypatch.setattr(demonstrations, "record_demonstration", lambda *_, **__: pytest.fail("again"))
+    monkeypatch.setattr(
+        demonstrations, "record_demonstration", lambda *_, **__: pytest.fail("again")
+    )
     again, (folder,) = obtain(BREAKOUT, LIFE)
     assert (again.transitions == first.transitions).all()
     assert isinstance(Demonstration.load(folder), Demonstration)

@@ -13,9 +13,9 @@ from torchrl.envs import Compose
 from giril_rl.config.schema import PPOConfig, TaskConfig
 from giril_rl.envs import GymVectorEnv, make_env
 from giril_rl.errors import UserError
-from giril_rl.policies.agent import make_agent
-from giril_rl.policies.pixel_policy import PixelActorCritic
-from giril_rl.policies.policy import NORMALISED, ActorCritic
+from giril_rl.policies.actor_critic import NORMALISED, ActorCritic
+from giril_rl.policies.making import make_agent
+from giril_rl.policies.pixel_actor_critic import PixelActorCritic
 from giril_rl.rewards import GenerativeReward
 from giril_rl.runs.checkpoint import load_state
 from giril_rl.runs.interrupt import Interrupted

@@ -11,8 +11,7 @@ from torchrl.objectives.value import GAE
 
 from giril_rl.config.schema import PPOConfig
 from giril_rl.envs import AtariEnv
-from giril_rl.policies.agent import make_agent
-from giril_rl.policies.pixel_policy import PixelActorCritic
+from giril_rl.policies import PixelActorCritic, make_agent
 from giril_rl.rewards import GenerativeReward
 from giril_rl.runs.interrupt import Interrupted
 from giril_rl.runs.run import Run

@@ -11,10 +11,11 @@ from torchrl.envs import Compose
 from torchrl.objectives.value import GAE
 
 from giril_rl.config.schema import AdversarialConfig, PPOConfig
-from giril_rl.graphs.recorded import record
-from giril_rl.graphs.traced import TracedGradients
-from giril_rl.policies.pixel_policy import PixelActorCritic
-from giril_rl.policies.policy import ActorCritic
+from giril_rl.graphs import recording
+from giril_rl.graphs.gradients import TracedGradients
+from giril_rl.graphs.recording import record
+from giril_rl.policies.actor_critic import ActorCritic
+from giril_rl.policies.pixel_actor_critic import PixelActorCritic
 from giril_rl.rewards import (
     AffineReward,
     BottleneckLoss,
@@ -33,7 +34,7 @@ from giril_rl.rewards import (
 )
 from giril_rl.rewards.actions import ActionEncoder
 from giril_rl.rewards.fitting import fit
-from giril_rl.training import AdversarialTrainer, recorded
+from giril_rl.training import AdversarialTrainer
 from giril_rl.training.ppo import PPO
 from giril_rl.transforms import BatchMeanReward, IntrinsicReward, ReturnScaling
 
@@ -81,7 +82,7 @@ class Eager(TracedGradients):
 
     def __init__(self, *args, **kwargs):
         super().__init__(*args, **kwargs)
-        self._recorded = False
+        self._graph._recorded = False
 
 
 def test_devices_do_not_mix():
@@ -236,7 +237,7 @@ def test_a_demonstration_is_taken_to_the_loss_it_is_fitted_by(monkeypatch):
 def test_a_graph_for_another_device_is_not_compiled(monkeypatch):
     # There are no values there to compare the graph's with.
     monkeypatch.setattr(torch, "equal", lambda *_: True)
-    monkeypatch.setattr(recorded, "_same", lambda *_: True)
+    monkeypatch.setattr(recording, "_equal", lambda *_: True)
     on_cpu, elsewhere = (
         record(lambda x: (x + x,), [torch.ones(2, device=device)]) for device in ("cpu", DEVICE)
     )

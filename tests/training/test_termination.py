@@ -12,8 +12,8 @@ from giril_rl.config.recipe_files import shipped
 from giril_rl.config.schema import PPOConfig, TaskConfig
 from giril_rl.envs import make_env
 from giril_rl.errors import UserError
-from giril_rl.policies.agent import make_agent
-from giril_rl.policies.policy import ActorCritic
+from giril_rl.policies.actor_critic import ActorCritic
+from giril_rl.policies.making import make_agent
 from giril_rl.runs.run import Run
 from giril_rl.training.loop import train_policy
 from giril_rl.training.ppo import PPO

@@ -11,8 +11,10 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from giril_rl.cli.command_line import main
 from giril_rl.demos import Demonstration
+from giril_rl.errors import UserError
 from giril_rl.files.disk import read_json, write_json
-from giril_rl.policies.agents import load_agent_from
+from giril_rl.files.untrusted import check_format
+from giril_rl.policies import load_agent_from
 from giril_rl.rewards import GenerativeReward
 from giril_rl.runs.checkpoint import load_state
 
@@ -115,3 +117,9 @@ def test_the_numbers_written_are_those_that_are_promised():
     numbers = {"run/policy": 1, "scaled_policy": 2}
     for name, number in {"demonstration": 1, "demonstration_of_images": 2, **numbers}.items():
         assert read_json(DATA / name / "card.json")["format_version"] == number
+
+
+@pytest.mark.parametrize("found", [0, None, "1", 1.0, True, [1], -1])
+def test_what_is_no_number_of_a_format_is_refused_with_what_to_do(found):
+    with pytest.raises(UserError, match=r"reads only 1: convert it\.$"):
+        check_format(found, [1], where="a has format", older="convert it")

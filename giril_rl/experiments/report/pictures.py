@@ -16,7 +16,7 @@ from giril_rl.experiments.report.rows import Panel, Row
 from giril_rl.experiments.report.runs import RunRecord
 from giril_rl.experiments.report.style import is_own
 from giril_rl.files.disk import read_json
-from giril_rl.policies.agent import load_agent
+from giril_rl.policies import load_agent
 from giril_rl.rewards import GenerativeReward
 from giril_rl.runs.finished import read_config, read_part, read_settings
 from giril_rl.runs.identity import safe

@@ -1,12 +1,10 @@
-"""PPO's policy and value network for pixels, one trunk under both heads."""
+"""PPO's agent for frames: one convolutional trunk under policy and value."""
 
 from __future__ import annotations
 
-import math
-
 import torch
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModule, TensorDictModuleBase
+from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.data import Categorical, OneHot, TensorSpec
 
@@ -15,27 +13,27 @@ from giril_rl.networks.action_bounds import single_action_spec
 from giril_rl.networks.distributions import CategoricalActions, OneHotActions
 from giril_rl.networks.pixels import flat_frames
 from giril_rl.networks.space_to_depth import SpaceToDepthConv, deal
-from giril_rl.policies.acting import ActingPolicy
-from giril_rl.runs.pretrained import Pretrained, remembered
+from giril_rl.policies.actor_critic import LossActor, PPOAgent, orthogonal
+from giril_rl.runs.pretrained import remembered
 
 HIDDEN = "hidden"
 DEALT = "dealt"
 STRIDE = 4
 
 
-class PixelActorCritic(Pretrained, nn.Module):
-    """Three convolutions and a layer of 512 under a categorical policy and a value.
+class PixelActorCritic(PPOAgent):
+    """Three convolutions and a layer of 512 units under a categorical policy and a value.
 
     8x8 of stride 4 to 32 channels, 4x4 of stride 2 to 64, 3x3 to 32, then 512, each with ReLU, on
-    frames divided by 255 (the released code's policy). Orthogonal initialisation with gain
-    sqrt(2), the policy's head 0.01, the value's 1.
+    frames divided by 255 (the released code's policy). Weights are initialised orthogonally with
+    gain sqrt(2), 0.01 for the policy's last layer and 1 for the value's.
 
-    The interface is that of :class:`~giril_rl.policies.policy.ActorCritic`. In PPO's loss the actor
-    leaves the trunk's output as ``"hidden"`` for the critic, so that the trunk runs once.
+    In PPO's loss the actor leaves the trunk's output as ``"hidden"`` for the critic, so that the
+    trunk runs once.
 
     Args:
-        actions: the environment's action spec, a :class:`torchrl.data.Categorical` or OneHot, of
-            which actions have the encoding; or a number of actions, which then are integers.
+        actions: the environment's action spec, a :class:`torchrl.data.Categorical` or OneHot, whose
+            encoding actions have; or a number of actions, which then are integers.
         channels: frames in an observation.
 
     Raises:
@@ -53,9 +51,9 @@ class PixelActorCritic(Pretrained, nn.Module):
     log_std = None
     bounds = None
     acting_keys = ("action", "action_log_prob", "state_value")
-    drawn_key = "action"
-    input_keys: tuple[str, ...] = (DEALT,)
-    """What the networks in PPO's loss read of a minibatch."""
+    input_keys = (DEALT,)
+    actor: PixelActor
+    critic: nn.Linear
 
     @remembered
     def __init__(self, actions: int | TensorSpec, channels: int = 4) -> None:
@@ -69,40 +67,42 @@ class PixelActorCritic(Pretrained, nn.Module):
         self.one_hot = isinstance(spec, OneHot)
         self.normaliser = nn.Identity()
         self.actor = PixelActor(int(spec.space.n), channels)
-        self.critic = nn.Linear(512, 1)
-        _orthogonal(self.critic, 1.0)
-
-    @property
-    def device(self) -> torch.device:
-        """Where its weights are."""
-        return self.critic.weight.device
+        self.critic = orthogonal(nn.Linear(512, 1), last=1.0)
 
     def hidden(self, observation: Tensor) -> Tensor:
         """The trunk's output ``(*batch, 512)`` for uint8 frames ``(*batch, channels, 84, 84)``."""
         return self.actor.hidden(observation)
 
     def distribution_and_value(self, observation: Tensor) -> tuple[CategoricalActions, Tensor]:
-        """The action distribution and the value ``(*batch, 1)`` of uint8 frames, trunk run once."""
+        """The action distribution and the value ``(*batch, 1)`` of uint8 frames."""
         hidden = self.hidden(observation)
         return self.distribution_of(hidden), self.critic(hidden)
 
     def distribution_of(self, hidden: Tensor) -> CategoricalActions:
-        """The action distribution given the trunk's output ``(*batch, 512)``."""
+        """The action distribution for the trunk's output ``(*batch, 512)``."""
         logits = self.actor.head(hidden)
         return OneHotActions(logits) if self.one_hot else CategoricalActions(logits)
 
-    def value_network(self) -> None:
-        """None: the acting policy has written the values, and :meth:`prepare` the next ones."""
+    def act(self, observation: Tensor, *, greedy: bool = False) -> tuple[Tensor, Tensor, Tensor]:
+        """An action, its log-probability ``(*batch)`` and the value ``(*batch, 1)``.
+
+        Args:
+            observation: uint8 frames ``(*batch, channels, 84, 84)``, where the weights are.
+            greedy: takes the most likely action instead of sampling.
+        """
+        distribution, value = self.distribution_and_value(observation)
+        action = distribution.mode if greedy else distribution.sample()
+        return action, distribution.log_prob(action), value
 
     @torch.no_grad()
     def prepare(self, batch: TensorDictBase, following: Tensor) -> None:
-        """Writes the value of what follows each step, which mostly is that of the next one.
+        """Writes the value of each next observation, and the frames as the loss reads them.
 
-        And the frames as the networks in PPO's loss take them, which all epochs share.
+        The next value is mostly that of the next step, which the acting policy has computed.
 
         Args:
-            batch: what the acting policy collected, ``(num_envs, time)``, with ``"state_value"``.
-            following: the observation that follows each step, uint8 ``(num_envs, time, ...)``.
+            batch: from the acting policy, ``(num_envs, time)``, with ``"state_value"``.
+            following: the next observation of each step, uint8 ``(num_envs, time, ...)``.
         """
         value = batch.get("state_value")
         after = value.roll(-1, 1)
@@ -112,35 +112,26 @@ class PixelActorCritic(Pretrained, nn.Module):
         batch.set(("next", "state_value"), after)
         batch.set(DEALT, self.actor.deal(batch.get("observation")))
 
-    def update_normaliser(self, observation: Tensor) -> None:
-        """Does nothing: frames are divided by a constant."""
+    def loss_distribution(self, minibatch: TensorDictBase) -> CategoricalActions:
+        """The action distribution for ``"dealt"`` frames; writes ``"hidden"`` for the critic.
 
-    def act(self, observation: Tensor, *, greedy: bool = False) -> tuple[Tensor, Tensor, Tensor]:
-        """An action, its log-probability ``(*batch)`` and the value ``(*batch, 1)``.
-
-        Args:
-            observation: uint8 frames ``(*batch, channels, 84, 84)``, where the weights are.
-            greedy: takes the most likely action rather than a draw.
+        In the loss, ``minibatch`` is the loss's own shallow copy.
         """
-        distribution, value = self.distribution_and_value(observation)
-        action = distribution.mode if greedy else distribution.sample()
-        return action, distribution.log_prob(action), value
+        hidden = self.actor.hidden_of_dealt(minibatch.get(DEALT))
+        minibatch.set(HIDDEN, hidden)
+        return self.distribution_of(hidden)
 
-    def acting(self) -> ActingPolicy:
-        """The module that acts in an environment; shares this one's parameters."""
-        return ActingPolicy(self)
-
-    def actor_for_loss(self) -> PixelLossActor:
+    def actor_for_loss(self) -> LossActor:
         """The module that gives :class:`torchrl.objectives.ClipPPOLoss` its distribution."""
-        return PixelLossActor(self)
+        return LossActor(self, out_keys=[HIDDEN])
 
     def critic_for_loss(self) -> TensorDictModule:
-        """The value's head on what :meth:`actor_for_loss` left, writing ``"state_value"``."""
+        """The critic on the ``"hidden"`` that the actor left, writing ``"state_value"``."""
         return TensorDictModule(self.critic, in_keys=[HIDDEN], out_keys=["state_value"])
 
 
 class PixelActor(nn.Module):
-    """The trunk and the policy's head: uint8 frames to logits, what behaviour cloning fits.
+    """The trunk and the policy's last layer: uint8 frames to logits. Behaviour cloning fits it.
 
     Args:
         actions: number of actions.
@@ -166,10 +157,7 @@ class PixelActor(nn.Module):
             nn.ReLU(),
         )
         self.head = nn.Linear(512, actions)
-        for layer in self.trunk:
-            if isinstance(layer, (nn.Conv2d, nn.Linear)):
-                _orthogonal(layer, math.sqrt(2))
-        _orthogonal(self.head, 0.01)
+        orthogonal(self, last=0.01)
 
     def deal(self, observation: Tensor) -> Tensor:
         """Frames ``(*batch, channels, 84, 84)`` as the trunk takes them, see :func:`deal`."""
@@ -187,35 +175,3 @@ class PixelActor(nn.Module):
     def forward(self, observation: Tensor) -> Tensor:
         """The logits ``(*batch, actions)``."""
         return self.head(self.hidden(observation))
-
-
-class PixelLossActor(TensorDictModuleBase):
-    """Gives the action distribution, and leaves the trunk's output for the critic."""
-
-    def __init__(self, agent: PixelActorCritic) -> None:
-        super().__init__()
-        self.in_keys = [DEALT]
-        self.out_keys = ["action", HIDDEN]
-        self.dist_sample_keys = [agent.drawn_key]
-        self.log_prob_keys = ["action_log_prob"]
-        self.agent = agent
-
-    def get_dist(self, tensordict: TensorDictBase) -> CategoricalActions:
-        """The distribution that the loss evaluates the recorded actions under.
-
-        Writes ``"hidden"`` into ``tensordict``, which in the loss is its own shallow copy of the
-        minibatch, the one that the critic gets next.
-        """
-        hidden = self.agent.actor.hidden_of_dealt(tensordict.get(DEALT))
-        tensordict.set(HIDDEN, hidden)
-        return self.agent.distribution_of(hidden)
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the distribution's mode as the action."""
-        return tensordict.set("action", self.get_dist(tensordict).mode)
-
-
-def _orthogonal(layer: nn.Conv2d | nn.Linear, gain: float) -> None:
-    nn.init.orthogonal_(layer.weight, gain)
-    if layer.bias is not None:
-        nn.init.zeros_(layer.bias)

@@ -12,9 +12,8 @@ from torch import nn
 from torch.nn.utils.parametrizations import spectral_norm
 from torchrl.data import Bounded
 
-from giril_rl.graphs.traced import TracedGradients
-from giril_rl.policies.policy import ActorCritic
-from giril_rl.policies.recorded_acting import RecordedActing
+from giril_rl.graphs import TracedGradients
+from giril_rl.policies import ActorCritic, RecordedActing
 
 
 class Loss(nn.Module):
@@ -160,6 +159,14 @@ def test_what_no_graph_can_do_runs_as_it_is_and_says_so_once(name):
     assert len([warning for warning in said if "recorded" in str(warning.message)]) == 1
 
 
+@pytest.mark.parametrize("name", ["dropout", "batch norm"])
+def test_without_torchscript_the_bits_are_the_same(name, monkeypatch):
+    monkeypatch.delattr(torch.jit, "trace")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert_as_eager(Loss(RECORDED[name]()), change=nn.Module.eval)
+
+
 def test_an_annealed_coefficient_is_heeded():
     def anneal(loss):
         loss.alpha = 0.25
@@ -168,7 +175,7 @@ def test_an_annealed_coefficient_is_heeded():
 
 
 def test_endless_kinds_of_batches_are_not_all_kept(monkeypatch):
-    monkeypatch.setattr("giril_rl.graphs.traced._MOST_GRAPHS", 2)
+    monkeypatch.setattr("giril_rl.graphs.recording._MOST_GRAPHS", 2)
     with pytest.warns(UserWarning, match="more than 2 kinds"):
         assert_as_eager(Loss(body()()), change=nn.Module.eval)
 

@@ -1,4 +1,4 @@
-"""A recorded graph compiled by torch, for a GPU as a CUDA graph."""
+"""``torch.compile`` for a recorded graph: with CUDA graphs on a GPU, and safe from Ctrl-C."""
 
 from __future__ import annotations
 
@@ -17,24 +17,18 @@ from giril_rl.errors import RunError
 def compiled(
     graph: Callable[..., tuple[Tensor, ...]], device: torch.device
 ) -> Callable[..., tuple[Tensor, ...]]:
-    """:func:`torch.compile` for one shape, which takes its time at the first call.
+    """Compiles a graph for one shape. The first call is slow.
 
-    The numbers are the graph's to rounding. Random ones are others of the same distribution, as
-    repeatable: torch's compiler draws a seed from the global generator at each call.
+    The results equal the graph's up to rounding. Random operations draw other numbers from the same
+    distribution: the compiler takes a seed from the global generator at each call.
 
     Args:
-        graph: a function of plain tensors that looks at no value.
-        device: where it runs. On CUDA its kernels are launched as one graph, where torch finds that
-            it can be.
+        graph: a function of tensors that does not branch on their values.
+        device: where it runs. On CUDA, torch launches its kernels as one CUDA graph where it can.
 
     Raises:
-        RunError: at the first call, if this machine cannot compile it, for want of a C++ compiler
-            for example.
-
-    Examples:
-        >>> double = compiled(lambda x: (x + x,), torch.device("cpu"))
-        >>> double(torch.tensor([1.0, 3.0]))  # doctest: +SKIP
-        (tensor([2., 6.]),)
+        RunError: at the first call, if this machine cannot compile, for example without a C++
+            compiler.
     """
     on_gpu = device.type == "cuda"
     function = torch.compile(
@@ -49,7 +43,7 @@ def compiled(
         with contextlib.nullcontext() if called else _compiling():
             out = function(*inputs)
         called = True
-        # A CUDA graph's next run writes where this one's results are.
+        # The next run of a CUDA graph overwrites the memory of these results.
         return tuple(x.clone() for x in out) if on_gpu else out
 
     return run
@@ -57,15 +51,14 @@ def compiled(
 
 @contextlib.contextmanager
 def _compiling() -> Iterator[None]:
-    """Keeps Ctrl-C from the compiler's processes, and tells in a sentence what went wrong.
+    """Blocks signals while the compiler's processes run, and turns its errors into one sentence.
 
-    A terminal sends Ctrl-C to them as well, and the library that one was writing would stay in
-    torch's cache, broken. They inherit which signals are blocked; this process stops at the next
-    safe point, as ever.
+    A terminal sends Ctrl-C to those processes too, and a library that is half written would stay in
+    torch's cache. They inherit the blocked signals; this process stops at its next safe point.
     """
-    masks = hasattr(signal, "pthread_sigmask")  # Windows has no signals to block.
+    masks = hasattr(signal, "pthread_sigmask")  # Windows cannot block signals.
     if masks:
-        resource_tracker.ensure_running()  # Where that is left to torch, it unblocks the signals.
+        resource_tracker.ensure_running()  # If torch starts it, it unblocks the signals.
         before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
     try:
         yield

@@ -20,9 +20,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from giril_rl.errors import UserError
 from giril_rl.networks.normalise import RunningNormaliser
-from giril_rl.policies.agents import load_agent_from
-from giril_rl.policies.pixel_policy import PixelActorCritic
-from giril_rl.policies.policy import NORMALISED, ActorCritic
+from giril_rl.policies import NORMALISED, ActorCritic, PixelActorCritic, load_agent_from
 
 SPECS = {
     "box": Bounded(-1, 1, shape=(8, 2)),

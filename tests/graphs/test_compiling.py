@@ -14,8 +14,7 @@ from torch import nn
 from torch._dynamo.exc import TorchDynamoException
 
 from giril_rl.errors import RunError
-from giril_rl.graphs.compiled import compiled
-from giril_rl.graphs.traced import TracedGradients
+from giril_rl.graphs import TracedGradients, compiled
 from giril_rl.rewards import BottleneckLoss
 
 ROWS = 6
@@ -152,7 +151,7 @@ def test_without_a_compiler_there_is_one_sentence(monkeypatch):
 
 CTRL_C = """
 import multiprocessing.resource_tracker, os, signal, subprocess, sys, torch
-from giril_rl.graphs.compiled import compiled
+from giril_rl.graphs import compiled
 from giril_rl.runs.interrupt import Interrupt
 
 def compiler(x):

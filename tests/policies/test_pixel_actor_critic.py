@@ -9,7 +9,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from torchrl.objectives import ClipPPOLoss
 
 from giril_rl.errors import UserError
-from giril_rl.policies.pixel_policy import PixelActorCritic
+from giril_rl.policies import PixelActorCritic
 
 CLIP, ENTROPY, VALUE = 0.1, 0.01, 0.5
 

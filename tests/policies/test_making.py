@@ -9,10 +9,15 @@ from torchrl.envs import GymEnv
 from giril_rl.config.schema import PPOConfig, TaskConfig
 from giril_rl.envs import make_env
 from giril_rl.errors import UserError
-from giril_rl.policies.agent import load_agent, make_agent
-from giril_rl.policies.agents import agent_for, check_actions, fits
-from giril_rl.policies.pixel_policy import PixelActorCritic
-from giril_rl.policies.policy import ActorCritic
+from giril_rl.policies import (
+    ActorCritic,
+    PixelActorCritic,
+    agent_for,
+    check_actions,
+    fits,
+    load_agent,
+    make_agent,
+)
 from giril_rl.training.scoring import evaluate
 
 CARTPOLE = TaskConfig(name="cartpole", env_id="CartPole-v1")

@@ -1,8 +1,9 @@
-"""Which policy and value network an environment needs."""
+"""Makes an environment's agent, loads a saved one, and checks that the two fit."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -10,30 +11,32 @@ import torch
 from torchrl.data import Categorical
 from torchrl.envs import EnvBase
 
+from giril_rl.config.schema import PPOConfig, TaskConfig
+from giril_rl.envs import BatchedEnv, make_env
 from giril_rl.errors import UserError
 from giril_rl.networks.action_bounds import single_action_spec, unsupported
-from giril_rl.policies.pixel_policy import PixelActorCritic
-from giril_rl.policies.policy import ActorCritic
+from giril_rl.policies.actor_critic import ActorCritic, PPOAgent
+from giril_rl.policies.agent import Agent
+from giril_rl.policies.pixel_actor_critic import PixelActorCritic
 from giril_rl.runs.pretrained import made_class, plain
+from giril_rl.runs.randomness import Use, seeded, stream_seed
 
-Agent = ActorCritic | PixelActorCritic
-"""PPO's policy and value network, of vectors or of pixels; both have the same methods."""
+POLICY = "policy"
+"""The folder of a run that holds its policy, see :class:`giril_rl.runs.pretrained.Pretrained`."""
 
 
-def agent_for(env: EnvBase, *, hidden: Sequence[int], normalise: bool) -> Agent:
-    """An untrained agent, initialised from torch's global generator.
+def agent_for(env: EnvBase, *, hidden: Sequence[int], normalise: bool) -> PPOAgent:
+    """An untrained agent for an environment, initialised from torch's global generator.
 
     Args:
-        env: a batched environment; bytes as observations are taken for frames.
+        env: a batched environment. Observations of bytes are frames.
         hidden: hidden layers of vector networks.
         normalise: whether vectors are normalised with running statistics.
 
     Raises:
-        UserError: for an action space of another kind than the networks have.
+        UserError: for an action space that no agent supports.
 
     Examples:
-        >>> from giril_rl.config.schema import TaskConfig
-        >>> from giril_rl.envs import make_env
         >>> env = make_env(TaskConfig(name="cartpole", env_id="CartPole-v1"), num_envs=1, seed=0)
         >>> type(agent_for(env, hidden=(16,), normalise=True)).__name__
         'ActorCritic'
@@ -46,8 +49,20 @@ def agent_for(env: EnvBase, *, hidden: Sequence[int], normalise: bool) -> Agent:
     return kind(**needs, hidden=hidden, normalise=normalise)
 
 
-def load_agent_from(folder: Path | str) -> Agent:
-    """The agent that its ``save_pretrained`` wrote, whichever of the two it is.
+def make_agent(env: BatchedEnv, cfg: PPOConfig, seed: int, *, use: Use = "training") -> PPOAgent:
+    """An untrained agent for ``env``, initialised from ``use`` and ``seed`` alone.
+
+    Examples:
+        >>> env = make_env(TaskConfig(name="cartpole", env_id="CartPole-v1"), num_envs=1, seed=0)
+        >>> make_agent(env, PPOConfig(), seed=0).critic(torch.zeros(1, 4)).shape
+        torch.Size([1, 1])
+    """
+    with seeded(stream_seed(use, seed)):
+        return agent_for(env, hidden=cfg.hidden, normalise=cfg.normalise_observations)
+
+
+def load_agent_from(folder: Path | str) -> PPOAgent:
+    """The agent that its ``save_pretrained`` wrote, of whichever class.
 
     Args:
         folder: the ``policy`` folder of a run, or a copy of it.
@@ -62,22 +77,37 @@ def load_agent_from(folder: Path | str) -> Agent:
         >>> policy.out_keys
         ['action', 'action_log_prob', 'state_value']
     """
-    kinds = {kind.__name__: kind for kind in (ActorCritic, PixelActorCritic)}
+    kinds: dict[str, type[Any]] = {x.__name__: x for x in (ActorCritic, PixelActorCritic)}
     return kinds.get(made_class(folder) or "", ActorCritic).from_pretrained(folder)
+
+
+def load_agent(run: Path, task: TaskConfig) -> PPOAgent:
+    """The policy of a finished run.
+
+    Raises:
+        UserError: if there is none, or it belongs to another task.
+    """
+    folder = run / POLICY
+    if not folder.is_dir():
+        raise UserError(f"{run} holds no trained policy: run it to its end first.")
+    agent = load_agent_from(folder)
+    with closing(make_env(task, 1, seed=0)) as env:
+        fitting = fits(agent, env)
+    if not fitting:
+        raise UserError(f"{folder} does not fit {task.name}: it belongs to another task's run.")
+    return agent
 
 
 def fits(agent: Agent, env: EnvBase) -> bool:
     """Whether an agent's observations and actions are those of an environment.
 
-    Actions are so in encoding, number and bounds. A policy cannot see these when it acts: in an
-    environment that expects one-hot actions, integers are all taken for the first action.
+    Actions fit if their encoding, number and bounds do. A policy cannot see these when it acts: an
+    environment that expects one-hot actions takes every integer for the first action.
 
     Raises:
-        UserError: for an action space that no agent has.
+        UserError: for an action space that no agent supports.
 
     Examples:
-        >>> from giril_rl.config.schema import TaskConfig
-        >>> from giril_rl.envs import make_env
         >>> env = make_env(TaskConfig(name="cartpole", env_id="CartPole-v1"), num_envs=1, seed=0)
         >>> fits(PixelActorCritic(2), env)
         False
@@ -94,10 +124,10 @@ def fits(agent: Agent, env: EnvBase) -> bool:
 
 
 def check_actions(agent: object, env: EnvBase) -> None:
-    """Refuses an agent whose actions an environment would take for others, without a word.
+    """Refuses an agent whose actions an environment would silently take for others.
 
     Args:
-        agent: what acts; only those of this package are looked at.
+        agent: what acts; only an :class:`~giril_rl.policies.Agent` is checked.
         env: where it acts.
 
     Raises:
@@ -112,7 +142,7 @@ def check_actions(agent: object, env: EnvBase) -> None:
         2} and the environment has {'action_spec': 'one_hot', 'n': 2}: make it with the
         environment's action_spec.
     """
-    if not isinstance(agent, (ActorCritic, PixelActorCritic)):
+    if not isinstance(agent, Agent):
         return
     made_with, wanted = _made_with(agent), plain(env.action_spec)
     found = made_with.get("action_spec", made_with.get("actions"))
@@ -131,7 +161,7 @@ def _made_with(agent: Agent) -> dict[str, Any]:
 
 
 def _needed(env: EnvBase) -> tuple[type[Any], dict[str, Any]]:
-    """The class of agent for an environment, and the arguments that the environment decides."""
+    """An environment's class of agent, and the arguments that the environment determines."""
     observation = env.observation_spec["observation"]
     actions = single_action_spec(env.action_spec)
     if actions.ndim - env.batch_dims != (0 if isinstance(actions, Categorical) else 1):
