@@ -12,7 +12,6 @@ from typing import cast
 from torchrl.envs import Compose
 
 from giril_rl.config.schema import (
-    CuriosityConfig,
     DemoConfig,
     ExpertConfig,
     FitConfig,
@@ -21,8 +20,12 @@ from giril_rl.config.schema import (
 )
 from giril_rl.demos import holdout, subsample
 from giril_rl.envs import make_env
-from giril_rl.methods import curiosity_reward
-from giril_rl.rewards import CuriosityRewardLoss, FeatureTraining
+from giril_rl.rewards import (
+    CuriosityConfig,
+    CuriosityRewardLoss,
+    FeatureTraining,
+    curiosity_reward,
+)
 from giril_rl.training import (
     Run,
     check_inputs,

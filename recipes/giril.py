@@ -14,14 +14,12 @@ from giril_rl.config.schema import (
     DemoConfig,
     ExpertConfig,
     FitConfig,
-    GenerativeConfig,
     RunConfig,
     ScalingConfig,
 )
 from giril_rl.demos import holdout, subsample
 from giril_rl.envs import make_env
-from giril_rl.methods import generative_reward
-from giril_rl.rewards import GenerativeRewardLoss
+from giril_rl.rewards import GenerativeConfig, GenerativeRewardLoss, generative_reward
 from giril_rl.training import (
     Run,
     check_inputs,

@@ -11,7 +11,6 @@ from pathlib import Path
 from torchrl.envs import Compose
 
 from giril_rl.config.schema import (
-    BottleneckConfig,
     DemoConfig,
     ExpertConfig,
     ScalingConfig,
@@ -19,8 +18,7 @@ from giril_rl.config.schema import (
 )
 from giril_rl.demos import subsample
 from giril_rl.envs import make_env
-from giril_rl.methods import bottleneck_reward
-from giril_rl.rewards import BottleneckLoss
+from giril_rl.rewards import BottleneckConfig, BottleneckLoss, bottleneck_reward
 from giril_rl.training import (
     AdversarialLearner,
     Run,

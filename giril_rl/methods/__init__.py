@@ -1,19 +1,6 @@
-"""What each method is made of."""
+"""The registry of methods, and the controls' recipe."""
 
-from giril_rl.methods.control_rewards import control_reward
-from giril_rl.methods.reward_models import (
-    bottleneck_reward,
-    copy_reward,
-    curiosity_reward,
-    discriminator_reward,
-    generative_reward,
-)
+from giril_rl.methods.controls import ControlRunConfig, control_reward
+from giril_rl.methods.registry import controls, methods
 
-__all__ = [
-    "bottleneck_reward",
-    "control_reward",
-    "copy_reward",
-    "curiosity_reward",
-    "discriminator_reward",
-    "generative_reward",
-]
+__all__ = ["ControlRunConfig", "control_reward", "controls", "methods"]

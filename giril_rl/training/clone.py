@@ -17,7 +17,7 @@ from giril_rl.errors import UserError
 from giril_rl.networks.normalise import RunningNormaliser
 from giril_rl.policies.agents import Agent
 from giril_rl.policies.policy import NORMALISED
-from giril_rl.rewards.chunks import PIXELS_AT_ONCE
+from giril_rl.rewards.transitions import PIXELS_AT_ONCE
 from giril_rl.runs.finite import Finite
 from giril_rl.runs.interrupt import Interrupt, Interrupted
 from giril_rl.runs.progress import progress

@@ -12,7 +12,7 @@ from torchrl.objectives import LossModule
 
 from giril_rl.config.schema import FitConfig
 from giril_rl.graphs.traced import TracedGradients
-from giril_rl.rewards.chunks import PIXELS_AT_ONCE
+from giril_rl.rewards.transitions import PIXELS_AT_ONCE
 from giril_rl.runs.finite import Finite
 from giril_rl.runs.interrupt import Interrupt, Interrupted
 from giril_rl.runs.progress import progress

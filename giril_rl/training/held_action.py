@@ -11,6 +11,7 @@ from giril_rl.config.schema import TaskConfig
 from giril_rl.demos.task import spaces_of
 from giril_rl.errors import UserError
 from giril_rl.networks.action_bounds import single_action_spec
+from giril_rl.rewards.method import RED, Method, register
 from giril_rl.runs.progress import progress
 from giril_rl.training.evaluate import evaluate
 
@@ -117,3 +118,16 @@ def _number_of_actions(spec: TensorSpec) -> int:
             "another control."
         )
     return int(spec.space.n)
+
+
+register(
+    Method(
+        HELD_ACTION,
+        "control: held action",
+        RED,
+        kind="control",
+        trained="never",
+        demonstration=False,
+        rank=208,
+    )
+)

@@ -11,6 +11,7 @@ from giril_rl.config.schema import TaskConfig
 from giril_rl.demos.task import spaces_of
 from giril_rl.errors import UserError
 from giril_rl.networks.action_bounds import affine_map, single_action_spec
+from giril_rl.rewards.method import GREY, Method, register
 from giril_rl.runs.randomness import stream_seed
 
 RANDOM = "control:random"
@@ -75,3 +76,16 @@ class RandomPolicy(TensorDictModuleBase):
 def _all_bounded(spec: TensorSpec) -> bool:
     bounds = affine_map(spec)
     return bool((bounds.low.isfinite() & bounds.high.isfinite()).all())
+
+
+register(
+    Method(
+        RANDOM,
+        "control: random",
+        GREY,
+        kind="control",
+        trained="never",
+        demonstration=False,
+        rank=207,
+    )
+)

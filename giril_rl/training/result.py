@@ -8,7 +8,7 @@ from typing import Any
 
 from torch import nn
 
-from giril_rl.config.schema import ControlRunConfig, DemoConfig, RunConfig, UnaveragedRunConfig
+from giril_rl.config.schema import DemoConfig, RunConfig, UnaveragedRunConfig
 from giril_rl.demos import Demonstration
 from giril_rl.demos.shipped import demonstration_name
 from giril_rl.files.disk import processor
@@ -143,11 +143,10 @@ def method_name(recipe: str, cfg: RunConfig) -> str:
     Examples:
         >>> method_name("my_recipe", RunConfig())
         'my_recipe'
-        >>> method_name("control", ControlRunConfig(reward="copy"))
-        'control:copy'
     """
-    if recipe == "control" and isinstance(cfg, ControlRunConfig):
-        return f"control:{cfg.reward}"
+    reward = getattr(cfg, "reward", None)
+    if recipe == "control" and isinstance(reward, str):
+        return f"control:{reward}"
     return recipe
 
 

@@ -1,7 +1,6 @@
 import torch
-from torch import nn
-
 from giril_rl.networks.joined import JoinedSequential
+from torch import nn
 
 
 def test_is_the_plain_sequence_on_concatenated_inputs():

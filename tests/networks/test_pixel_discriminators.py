@@ -2,10 +2,10 @@ import copy
 
 import pytest
 import torch
+from giril_rl.networks.pixel_discriminators import PixelBottleneck, PixelDiscriminator
 from torch import nn
 
 from giril_rl.errors import UserError
-from giril_rl.networks.pixel_discriminators import PixelBottleneck, PixelDiscriminator
 
 
 def frames(*batch, channels=4):

@@ -2,9 +2,8 @@
 
 import pytest
 import torch
-from torch import nn
-
 from giril_rl.networks.upsampling import ChannelsLast, RowsTransposedConv, TransposedConv
+from torch import nn
 
 LAYERS = {
     "strided": lambda: (TransposedConv(3, 5, 3, stride=2), nn.ConvTranspose2d(3, 5, 3, stride=2)),

@@ -1,6 +1,5 @@
 import pytest
 import torch
-
 from giril_rl.rewards.chunks import in_chunks
 
 

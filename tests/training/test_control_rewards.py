@@ -1,5 +1,6 @@
 import pytest
 import torch
+from giril_rl.methods.control_rewards import control_reward, moments
 from tensordict import TensorDict
 
 from giril_rl.config.schema import (
@@ -12,7 +13,6 @@ from giril_rl.config.schema import (
 )
 from giril_rl.demos import Demonstration
 from giril_rl.envs import make_env
-from giril_rl.methods.control_rewards import control_reward, moments
 from giril_rl.rewards import (
     AffineReward,
     ConstantReward,

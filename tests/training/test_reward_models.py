@@ -2,6 +2,14 @@
 
 import pytest
 import torch
+from giril_rl.methods.reward_models import (
+    bottleneck_reward,
+    copy_reward,
+    curiosity_reward,
+    discriminator_reward,
+    generative_reward,
+)
+from giril_rl.networks.pixel_discriminators import PixelBottleneck, PixelDiscriminator
 from tensordict import TensorDict
 
 from giril_rl.config.schema import (
@@ -13,15 +21,7 @@ from giril_rl.config.schema import (
 )
 from giril_rl.envs import make_env
 from giril_rl.errors import UserError
-from giril_rl.methods.reward_models import (
-    bottleneck_reward,
-    copy_reward,
-    curiosity_reward,
-    discriminator_reward,
-    generative_reward,
-)
 from giril_rl.networks.pixel_decoder import PixelDecoder
-from giril_rl.networks.pixel_discriminators import PixelBottleneck, PixelDiscriminator
 from giril_rl.networks.pixels import PixelEncoder, PixelFeatures, PixelPrior
 from giril_rl.rewards import ObservationScaler, PixelScaler
 

@@ -1,0 +1,130 @@
+"""The recipe `control`: its settings, and the reward that its registry entry describes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+
+from giril_rl.config.schema import (
+    DemoConfig,
+    ExpertConfig,
+    FitConfig,
+    RunConfig,
+    ScalingConfig,
+    knob,
+)
+from giril_rl.demos import Demonstration, holdout, subsample
+from giril_rl.envs import BatchedEnv
+from giril_rl.methods.registry import controls
+from giril_rl.rewards import CuriosityConfig, GenerativeConfig
+from giril_rl.rewards.method import Method
+from giril_rl.runs.metrics import METRICS, read_metrics
+from giril_rl.runs.run import Run
+from giril_rl.training.fit import fit_reward
+from giril_rl.transforms.intrinsic import device_of
+
+
+@dataclass
+class ControlRunConfig(RunConfig):
+    """Settings of the controls' recipe; those that the chosen reward does not use are not read."""
+
+    reward: str = knob(
+        "constant",
+        "the reward that stands in for a learned one; random: no reward, a random policy's score; "
+        "held_action: no reward, the score of one action all the time, the best one",
+        choices=list(controls()),
+    )
+    held_episodes: int = knob(20, "held_action: episodes that choose the action", low=1)
+    expert: ExpertConfig = field(default_factory=ExpertConfig)
+    demo: DemoConfig = field(default_factory=DemoConfig)
+    giril: GenerativeConfig = field(default_factory=GenerativeConfig)
+    icm: CuriosityConfig = field(default_factory=CuriosityConfig)
+    fit: FitConfig = field(default_factory=FitConfig)
+    scaling: ScalingConfig = field(default_factory=ScalingConfig)
+
+    @property
+    def method(self) -> Method:
+        """The registry's entry of the control."""
+        return controls()[self.reward]
+
+    @property
+    def needs_demonstration(self) -> bool:
+        """Whether the control is made of a demonstration, and so of an expert."""
+        return self.method.demonstration
+
+    @property
+    def trains(self) -> bool:
+        """Whether a policy is trained on a reward, rather than a fixed policy scored."""
+        return self.method.build is not None
+
+
+def control_reward(
+    cfg: ControlRunConfig, env: BatchedEnv, demo: Demonstration | None, run: Run
+) -> tuple[TensorDictModuleBase, dict[str, int]]:
+    """The reward module that ``cfg.reward`` names, and the seeds that it depends on.
+
+    Args:
+        cfg: the run's settings; ``cfg.giril`` and ``cfg.icm`` mean what they do in their recipes.
+        env: the environment, for its specs.
+        demo: the demonstration; None for a control that needs none.
+        run: where a fit's metrics and checkpoints go, and the moments that were matched.
+
+    Raises:
+        UserError: if the fitted reward is the same for all transitions and noise should match it.
+    """
+    method = cfg.method
+    assert method.build is not None
+    settings = next((p for p in (cfg.giril, cfg.icm) if type(p) is method.settings), None)
+    seed = cfg.seed if settings is None or settings.seed is None else settings.seed
+    pairs = None if demo is None else subsample(demo, cfg.demo.subsample)
+    reward = method.build(settings, env, pairs, seed=seed).to(cfg.device)
+    # A reward without weights, such as the copy, depends on no seed.
+    seeds = {"reward": seed} if list(reward.parameters()) else {}
+    if method.loss is not None:
+        assert demo is not None and pairs is not None
+        fit_reward(
+            method.loss(reward, settings),
+            pairs,
+            cfg.fit,
+            seed=seed,
+            run=run,
+            held_out=holdout(demo, cfg.demo.subsample),
+        )
+    if method.derive is None:
+        return reward, seeds
+    return method.derive(reward, lambda: _logged_moments(reward, pairs, run), seed), seeds
+
+
+def _logged_moments(
+    reward: TensorDictModuleBase, pairs: TensorDictBase | None, run: Run
+) -> tuple[float, float]:
+    assert pairs is not None
+    mean, variance = moments(reward, pairs)
+    # A resumed run has them already, before the rows that it continues.
+    if not any(row.get("phase") == "moments" for row in read_metrics(run.folder / METRICS)):
+        run.log(0, {"moments/mean": mean, "moments/variance": variance}, phase="moments")
+    return mean, variance
+
+
+@torch.no_grad()
+def moments(reward: TensorDictModuleBase, data: TensorDictBase) -> tuple[float, float]:
+    """Mean and (population) variance of a reward over transitions.
+
+    Args:
+        reward: a module that writes one key, one value per transition.
+        data: the transitions, which stay as they are.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> from giril_rl.rewards import ConstantReward
+        >>> data = TensorDict({"observation": torch.zeros(4, 2)}, [4])
+        >>> moments(ConstantReward(3.0), data)
+        (3.0, 0.0)
+    """
+    view = data.select(*reward.in_keys)
+    device = device_of(reward)
+    values = reward(view if device is None else view.to(device)).get(reward.out_keys[0]).double()
+    return values.mean().item(), values.var(correction=0).item()
