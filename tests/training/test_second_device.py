@@ -10,12 +10,13 @@ from torchrl.data import Bounded, Categorical
 from torchrl.envs import Compose
 from torchrl.objectives.value import GAE
 
-from giril_rl.config.schema import AdversarialConfig, PPOConfig
+from giril_rl.config.schema import PPOConfig
 from giril_rl.graphs.recorded import record
 from giril_rl.graphs.traced import TracedGradients
 from giril_rl.policies.pixel_policy import PixelActorCritic
 from giril_rl.policies.policy import ActorCritic
 from giril_rl.rewards import (
+    AdversarialConfig,
     AffineReward,
     BottleneckLoss,
     BottleneckReward,
