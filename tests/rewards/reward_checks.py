@@ -75,9 +75,7 @@ def check_depends_on_what_it_says(case: Case) -> None:
         value = other.get(PLAIN[entry])
         value[3] = (value[3] + 1) % 3 if entry == "action" and case.discrete else value[3] * 0.7
         changed = (rewards(module, other) != whole).squeeze(-1)
-        assert changed.tolist() == [i == 3 and entry in claimed for i in range(8)], (
-            entry
-        )
+        assert changed.tolist() == [i == 3 and entry in claimed for i in range(8)], entry
 
 
 def check_no_gradient_reaches_the_policy(case: Case) -> None:
