@@ -1,26 +1,52 @@
-"""Old names of modules, for one deprecation cycle: they work, warn and name the new one."""
+"""Old names, for one deprecation cycle: they work, warn and name the new one."""
 
 from __future__ import annotations
 
 import importlib.util
 import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib.abc import Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec
 from types import ModuleType
+from typing import Any
 
 MOVED = {
     "configs": "config.schema",
+    "methods.control_rewards": "methods.controls",
     "networks.acting": "policies.agent",
     "networks.agents": "policies.making",
+    "networks.pixel_discriminators": "networks.pixels",
     "networks.pixel_policy": "policies.pixel_actor_critic",
     "networks.policy": "policies.actor_critic",
     "pretrained": "runs.pretrained",
+    "rewards.affine": "rewards.controls",
+    "rewards.bottleneck_loss": "rewards.bottleneck",
+    "rewards.chunks": "rewards.transitions",
+    "rewards.constant": "rewards.controls",
+    "rewards.copy": "rewards.controls",
+    "rewards.curiosity_loss": "rewards.curiosity",
+    "rewards.discriminator_loss": "rewards.discriminator",
+    "rewards.equations": "rewards.generative",
+    "rewards.generative_loss": "rewards.generative",
+    "rewards.noise": "rewards.controls",
+    "rewards.pixel_scaler": "rewards.scaler",
+    "rewards.transition_loss": "rewards.fitting",
     "training.checkpoint": "runs.checkpoint",
     "training.run": "runs.run",
 }
-"""What version 0.1 documented, or a copied recipe of its imports, below ``giril_rl``."""
+"""Modules that version 0.1 documented, or that its recipes import, below ``giril_rl``."""
+
+MOVED_NAMES: Mapping[str, Mapping[str, str]] = {
+    "config.schema": {
+        "AdversarialConfig": "rewards",
+        "BottleneckConfig": "rewards",
+        "ControlRunConfig": "methods.controls",
+        "CuriosityConfig": "rewards",
+        "GenerativeConfig": "rewards",
+    },
+}
+"""Names that left a module that is still there, and the modules that they are in now."""
 
 
 class MovedModules(MetaPathFinder, Loader):
@@ -62,3 +88,20 @@ def install() -> None:
     """Lets the old names be imported, which is asked for once."""
     if not any(isinstance(finder, MovedModules) for finder in sys.meta_path):
         sys.meta_path.append(MovedModules())
+
+
+def find(module: str, name: str) -> Any:
+    """What ``name`` of ``module`` is now, for the ``__getattr__`` of a module in MOVED_NAMES.
+
+    Raises:
+        AttributeError: if the module never had the name.
+    """
+    new = MOVED_NAMES[module].get(name)
+    if new is None:
+        raise AttributeError(f"module 'giril_rl.{module}' has no attribute {name!r}")
+    warnings.warn(
+        f"giril_rl.{module}.{name} is now giril_rl.{new}.{name}; the old name goes in version 0.3.",
+        DeprecationWarning,
+        stacklevel=3,
+    )
+    return getattr(importlib.import_module(f"giril_rl.{new}"), name)

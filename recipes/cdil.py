@@ -11,11 +11,10 @@ from typing import cast
 
 from torchrl.envs import Compose
 
-from giril_rl.config.schema import AveragedRunConfig, CuriosityConfig, FitConfig
+from giril_rl.config.schema import AveragedRunConfig, FitConfig
 from giril_rl.demos import holdout, subsample
 from giril_rl.envs import make_env
-from giril_rl.methods import curiosity_reward
-from giril_rl.rewards import CuriosityRewardLoss, FeatureTraining
+from giril_rl.rewards import CuriosityConfig, CuriosityRewardLoss, FeatureTraining, curiosity_reward
 from giril_rl.training import (
     PPO,
     finish_run,

@@ -10,9 +10,8 @@ from pathlib import Path
 
 from torchrl.envs import Compose
 
-from giril_rl.config.schema import ControlRunConfig
 from giril_rl.envs import make_env
-from giril_rl.methods import baseline_policy, check_baseline, control_reward
+from giril_rl.methods import ControlRunConfig, baseline_policy, check_baseline, control_reward
 from giril_rl.training import (
     PPO,
     Trained,

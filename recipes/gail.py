@@ -10,11 +10,10 @@ from pathlib import Path
 
 from torchrl.envs import Compose
 
-from giril_rl.config.schema import AdversarialConfig, RewardRunConfig
+from giril_rl.config.schema import RewardRunConfig
 from giril_rl.demos import subsample
 from giril_rl.envs import make_env
-from giril_rl.methods import discriminator_reward
-from giril_rl.rewards import DiscriminatorLoss
+from giril_rl.rewards import AdversarialConfig, DiscriminatorLoss, discriminator_reward
 from giril_rl.training import (
     PPO,
     AdversarialTrainer,

@@ -10,11 +10,10 @@ from pathlib import Path
 
 from torchrl.envs import Compose
 
-from giril_rl.config.schema import AveragedRunConfig, FitConfig, GenerativeConfig
+from giril_rl.config.schema import AveragedRunConfig, FitConfig
 from giril_rl.demos import holdout, subsample
 from giril_rl.envs import make_env
-from giril_rl.methods import generative_reward
-from giril_rl.rewards import GenerativeRewardLoss
+from giril_rl.rewards import GenerativeConfig, GenerativeRewardLoss, generative_reward
 from giril_rl.training import (
     PPO,
     finish_run,

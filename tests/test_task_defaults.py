@@ -5,14 +5,9 @@ from giril_rl.config.compose import resolved
 from giril_rl.config.leaves import flat, leaves
 from giril_rl.config.recipe_config import config_class
 from giril_rl.config.recipe_files import find, shipped, shipped_conf
-from giril_rl.config.schema import (
-    ControlRunConfig,
-    ExpertRunConfig,
-    PPOConfig,
-    RunConfig,
-    TaskConfig,
-)
+from giril_rl.config.schema import ExpertRunConfig, PPOConfig, RunConfig, TaskConfig
 from giril_rl.config.task_defaults import apply_task_defaults, task_defaults
+from giril_rl.methods import ControlRunConfig
 
 PONG, PENDULUM = "ALE/Pong-v5", "Pendulum-v1"
 RECIPES = [recipe.name for recipe in shipped()]

@@ -4,13 +4,10 @@ from dataclasses import dataclass, field
 import pytest
 
 from giril_rl.config.schema import (
-    AdversarialConfig,
-    CuriosityConfig,
     DemoConfig,
     ExpertConfig,
     ExpertRunConfig,
     FitConfig,
-    GenerativeConfig,
     PPOConfig,
     RunConfig,
     ScalingConfig,
@@ -19,6 +16,7 @@ from giril_rl.config.schema import (
 )
 from giril_rl.config.validation import notices, validate
 from giril_rl.errors import UserError
+from giril_rl.rewards import AdversarialConfig, CuriosityConfig, GenerativeConfig
 
 
 @dataclass

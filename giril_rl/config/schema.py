@@ -13,6 +13,8 @@ from typing import Any
 
 from omegaconf import MISSING
 
+from giril_rl import moved
+
 MOST = 2**63 - 1
 """The largest whole number of any knob: what torch takes for a seed or a size, and files keep."""
 MOST_THREADS = 1024
@@ -200,96 +202,6 @@ class DemoConfig:
 
 
 @dataclass
-class GenerativeConfig:
-    """GIRIL's conditional VAE and the reward made of it."""
-
-    beta: float = knob(
-        1.0,
-        "weight of the true action against the encoded one, in (0, 1]",
-        low=0,
-        high=1,
-        low_open=True,
-    )
-    alpha: float | None = knob(
-        None, "weight of the action term; null: 1 for Box, 100 for Discrete", low=0
-    )
-    scale: float = knob(1.0, "lambda, the weight of the squared error", low=0, low_open=True)
-    prior: str = knob(
-        "standard",
-        "latent prior: standard N(0, I) or conditional p(z | s)",
-        choices=("standard", "conditional"),
-    )
-    normalise: str = knob(
-        "standardise",
-        "observation rule of the reward model",
-        choices=("demo_range", "standardise", "raw", "pixels"),
-    )
-    clamp: bool = knob(True, "clamp observations to [-1, 1], those of normalise=raw too")
-    hidden: list[int] = knob([100, 100], "hidden layers of encoder and decoder (tanh)", low=1)
-    seed: int | None = knob(None, "seed of the reward model; null takes the run's seed", low=0)
-
-
-@dataclass
-class AdversarialConfig:
-    """GAIL's discriminator, its training and the reward made of it."""
-
-    form: str = knob(
-        "positive",
-        "reward of D = P(expert): positive -log(1-D), negative log D, log_ratio, reversed -log D",
-        choices=("positive", "negative", "log_ratio", "reversed"),
-    )
-    lr: float = knob(1e-3, "Adam step size (paper: 1e-3)", low=0, low_open=True)
-    updates: int = knob(10, "gradient steps with each batch of PPO", low=1)
-    batch: int = knob(250, "most pairs of expert and of policy in each gradient step", low=1)
-    penalty: float = knob(1.0, "weight of the gradient penalty; 0 leaves it out", low=0)
-    normalise: str = knob(
-        "standardise",
-        "observation rule: running statistics of the policy, or one of the demonstration",
-        choices=("running", "demo_range", "standardise", "raw", "pixels"),
-    )
-    clamp: float | None = knob(
-        10.0, "bound on normalised observations; null has none", low=0, low_open=True
-    )
-    hidden: list[int] = knob([100, 100], "hidden layers of the discriminator (tanh)", low=1)
-    seed: int | None = knob(None, "seed of the discriminator; null takes the run's seed", low=0)
-    compile: bool = knob(False, COMPILE)
-
-
-@dataclass
-class BottleneckConfig(AdversarialConfig):
-    """VAIL's discriminator with its information bottleneck."""
-
-    penalty: float = knob(0.0, "weight of the gradient penalty; 0 leaves it out", low=0)
-    information: float = knob(0.5, "I_c, nats through the bottleneck (paper: 0.5)", low=0)
-    latent: int = knob(8, "size of the bottleneck's code", low=1)
-    beta_start: float = knob(0.0, "first weight of the constraint", low=0)
-    beta_step: float = knob(1e-2, "dual step on that weight for each nat too many", low=0)
-
-
-@dataclass
-class CuriosityConfig:
-    """CDIL's intrinsic curiosity module and the reward made of it."""
-
-    features: str = knob(
-        "inverse",
-        "what trains the features: L_I alone, L_I + L_F, or nothing (random, as released)",
-        choices=("inverse", "both", "none"),
-    )
-    scale: float = knob(1.0, "lambda, the weight of the squared error", low=0, low_open=True)
-    normalise: str = knob(
-        "standardise",
-        "observation rule of the reward model",
-        choices=("demo_range", "standardise", "raw", "pixels"),
-    )
-    clamp: bool = knob(True, "clamp observations to [-1, 1], those of normalise=raw too")
-    hidden: list[int] = knob([100, 100], "layers of the features (tanh); [] takes none", low=1)
-    model_hidden: list[int] = knob(
-        [100], "hidden layers of inverse and forward model (tanh)", low=1
-    )
-    seed: int | None = knob(None, "seed of the reward model; null takes the run's seed", low=0)
-
-
-@dataclass
 class FitConfig:
     """Training of a reward model on the demonstration."""
 
@@ -443,32 +355,5 @@ class UnaveragedRunConfig(RunConfig):
     termination: str = knob("ends", "no effect here", choices=("ends", "bootstrap"))
 
 
-@dataclass
-class ControlRunConfig(AveragedRunConfig):
-    """What the controls' recipe takes; what the chosen reward has no use for is not read."""
-
-    reward: str = knob(
-        "constant",
-        "the reward that stands in for a learned one; random: no reward, a random policy's score; "
-        "held_action: no reward, the score of one action all the time, the best one",
-        choices=(
-            "constant",
-            "untrained_giril",
-            "untrained_icm",
-            "copy",
-            "noise",
-            "negated_giril",
-            "centred_giril",
-            "random",
-            "held_action",
-        ),
-    )
-    held_episodes: int = knob(20, "held_action: episodes that choose the action", low=1)
-    giril: GenerativeConfig = field(default_factory=GenerativeConfig)
-    icm: CuriosityConfig = field(default_factory=CuriosityConfig)
-    fit: FitConfig = field(default_factory=FitConfig)
-
-    @property
-    def needs_demonstration(self) -> bool:
-        """Whether the control is made of a demonstration, and so of an expert."""
-        return self.reward not in ("constant", "random", "held_action")
+def __getattr__(name: str) -> Any:
+    return moved.find("config.schema", name)

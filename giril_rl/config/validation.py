@@ -178,11 +178,10 @@ def validate(config: Any) -> None:
         UserError: names the first key whose value is refused.
 
     Examples:
-        >>> from giril_rl.config.schema import GenerativeConfig
-        >>> validate(GenerativeConfig(beta=0.0))
+        >>> validate(PPOConfig(gamma=1.5))
         Traceback (most recent call last):
         ...
-        giril_rl.errors.UserError: beta=0.0 must be in (0, 1].
+        giril_rl.errors.UserError: gamma=1.5 must be in [0, 1].
     """
     for leaf in leaves(type(config)):
         value = config
@@ -225,7 +224,7 @@ def notices(config: Any) -> list[str]:
         ['steps=15000 is no multiple of a batch (16 * 125 = 2,000): 16,000 steps are taken.']
     """
     found = []
-    trains = getattr(config, "reward", None) not in ("random", "held_action")
+    trains = getattr(config, "trains", True)
     if isinstance(config, RunConfig) and trains:  # Of cloning, steps are 0.
         found += _rounding("steps", config.steps, config.ppo)
     expert, demo = getattr(config, "expert", None), getattr(config, "demo", None)

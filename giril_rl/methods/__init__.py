@@ -1,21 +1,18 @@
-"""What each method is made of."""
+"""The registry of methods, and the controls' recipe."""
 
-from giril_rl.methods.control_rewards import baseline_policy, check_baseline, control_reward
-from giril_rl.methods.reward_models import (
-    bottleneck_reward,
-    copy_reward,
-    curiosity_reward,
-    discriminator_reward,
-    generative_reward,
+from giril_rl.methods.controls import (
+    ControlRunConfig,
+    baseline_policy,
+    check_baseline,
+    control_reward,
 )
+from giril_rl.methods.registry import controls, methods
 
 __all__ = [
+    "ControlRunConfig",
     "baseline_policy",
-    "bottleneck_reward",
     "check_baseline",
     "control_reward",
-    "copy_reward",
-    "curiosity_reward",
-    "discriminator_reward",
-    "generative_reward",
+    "controls",
+    "methods",
 ]

@@ -9,6 +9,8 @@ import giril_rl.rewards
 import giril_rl.training
 from giril_rl.rewards.method import Method, registered
 
+CONTROL = "control:"
+
 
 def methods() -> dict[str, Method]:
     """Every method and control by its name, in the order of tables.
@@ -24,3 +26,17 @@ def methods() -> dict[str, Method]:
         for module in pkgutil.iter_modules(package.__path__, f"{package.__name__}."):
             import_module(module.name)
     return registered()
+
+
+def controls() -> dict[str, Method]:
+    """The controls by their names in the recipe `control`.
+
+    Examples:
+        >>> controls()["copy"].label
+        'control: copy'
+    """
+    return {
+        name.removeprefix(CONTROL): method
+        for name, method in methods().items()
+        if method.kind == "control"
+    }

@@ -1,6 +1,6 @@
-"""Action specs that networks can speak, and the affine map between [-1, 1] and an action's bounds.
+"""Supported action specs, and the affine map between [-1, 1] and an action's bounds.
 
-Policies draw actions in units in which the bounds are -1 and 1, and reward models see them so.
+Policies and reward models see actions in units in which the bounds are -1 and 1.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def single_action_spec(spec: TensorSpec) -> TensorSpec:
 
 
 def unsupported(spec: TensorSpec) -> UserError:
-    """The refusal of an action spec of another kind or shape."""
+    """The error for an action spec of another kind or shape."""
     return UserError(
         f"an action spec of the kind {type(spec).__name__} with shape {tuple(spec.shape)} and "
         f"{spec.dtype} is not supported: give a single Categorical, OneHot or one-dimensional "
@@ -60,7 +60,7 @@ def unsupported(spec: TensorSpec) -> UserError:
 class AffineMap(NamedTuple):
     """Bounds of each action dimension, and the map ``offset + half_range * u`` to them.
 
-    It takes -1 and 1 to the bounds. A dimension without two finite bounds keeps its unit:
+    The map takes -1 and 1 to the bounds. A dimension without two finite bounds keeps its unit:
     ``offset`` 0, ``half_range`` 1. All are float64 ``(size,)`` on the CPU; a missing bound is
     infinite.
     """
@@ -102,11 +102,11 @@ def affine_map(spec: TensorSpec) -> AffineMap:
 
 
 class ActionBounds(nn.Module):
-    """Maps what a policy draws to an action within the bounds.
+    """Maps a policy's draw to an action within the bounds.
 
     A draw ``u`` becomes ``offset + half_range * u``, clamped to the bounds: -1 and 1 become the
-    bounds themselves. A dimension without two finite bounds keeps its unit, and is clamped to the
-    one that it has. The buffers follow from the spec and are not saved.
+    bounds themselves. A dimension without two finite bounds keeps its unit and is clamped to the
+    bound that it has, if any. The buffers follow from the spec and are not saved.
 
     Args:
         affine: the map of a spec, see :func:`affine_map`.
@@ -133,7 +133,7 @@ class ActionBounds(nn.Module):
 
     @classmethod
     def of(cls, spec: TensorSpec) -> ActionBounds | None:
-        """Those of an action spec; None where there are none, or actions are discrete."""
+        """The bounds of an action spec; None if it has none, or actions are discrete."""
         spec = single_action_spec(spec)
         if isinstance(spec, (Categorical, OneHot)):
             return None

@@ -1,7 +1,7 @@
-"""The action distributions of PPO, with nothing around them.
+"""Lean action distributions for PPO.
 
-They compute what ``torch.distributions`` does (the tests hold them to it) without that module's
-argument checks and broadcasting, which at these network sizes cost as much as the network.
+They compute what ``torch.distributions`` does, as the tests check, without its argument checks and
+broadcasting, which at these network sizes cost as much as the network.
 """
 
 from __future__ import annotations
@@ -22,7 +22,6 @@ class DiagonalGaussian:
         log_std: ``(action_dim,)``, independent of the state.
 
     Examples:
-        >>> import torch
         >>> d = DiagonalGaussian(torch.zeros(3, 1), torch.zeros(1))
         >>> d.log_prob(torch.zeros(3, 1))
         tensor([-0.9189, -0.9189, -0.9189])
@@ -61,7 +60,6 @@ class CategoricalActions:
         logits: ``(*batch, actions)``, not normalised.
 
     Examples:
-        >>> import torch
         >>> CategoricalActions(torch.zeros(2, 4)).log_prob(torch.tensor([0, 3]))
         tensor([-1.3863, -1.3863])
     """
@@ -93,7 +91,6 @@ class OneHotActions(CategoricalActions):
     """The same distribution over one-hot actions.
 
     Examples:
-        >>> import torch
         >>> OneHotActions(torch.tensor([0.0, 1.0])).mode
         tensor([0, 1])
     """

@@ -1,9 +1,13 @@
-"""Running normalisation of observations, a part of the policy that is saved with it."""
+"""Running normalisation of observations, and batch normalisation by its running statistics."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 import torch
 from torch import Tensor, nn
+from torch.nn.modules.batchnorm import _BatchNorm
 
 from giril_rl.errors import UserError
 
@@ -11,26 +15,25 @@ from giril_rl.errors import UserError
 class RunningNormaliser(nn.Module):
     """Subtracts the running mean, divides by the running standard deviation, clips.
 
-    The statistics change only in :meth:`update`, once for a whole batch and after PPO has used it,
-    so that the probabilities recorded while collecting are those of the very policy that collected.
-    TorchRL's ``VecNormV2`` updates at every environment step instead, and keeps the statistics in
-    the environment rather than with the policy that cannot do without them. The clipping at 10 and
-    the first count of 1e-4 are those of OpenAI baselines' ``VecNormalize``.
+    The statistics change only in :meth:`update`, once per batch, after PPO has used it. So the
+    recorded action probabilities are those of the policy that collected. TorchRL's ``VecNormV2``
+    updates at every environment step and keeps the statistics in the environment, while the policy
+    cannot do without them. The clipping at 10 and the initial count of 1e-4 are those of OpenAI
+    baselines' ``VecNormalize``.
 
     Args:
         size: size of the last dimension.
         clip: bound on the normalised value.
         eps: added to the variance.
 
+    Raises:
+        UserError: for observations of another size.
+
     Examples:
-        >>> import torch
         >>> normalise = RunningNormaliser(2)
         >>> normalise.update(torch.tensor([[0.0, 10.0], [2.0, 30.0]]))
         >>> normalise(torch.tensor([2.0, 10.0])).round(decimals=2)
         tensor([ 1., -1.])
-
-    Raises:
-        UserError: for observations of another size.
     """
 
     event_dims = 1
@@ -64,31 +67,26 @@ class RunningNormaliser(nn.Module):
 
         Args:
             observation: raw observations.
-            least: smallest deviation to divide by. A good player hardly moves some of its
-                observations; divided by so little, what it never saw would be far out of range.
+            least: smallest standard deviation to divide by. A good player hardly moves some of its
+                observations. Divided by so little, unseen values would be far out of range.
 
         Raises:
-            UserError: for another size, NaN or infinity; the statistics are then as they were.
+            UserError: for another size, NaN or infinity; the statistics then stay as they were.
         """
-        check_size(observation, self.mean)
-        _check_finite(observation)
-        batch = observation.reshape(-1, observation.shape[-1]).double()
+        batch = self._checked(observation)
         self.mean.copy_(batch.mean(0))
         self.var.copy_(batch.var(0, correction=0).clamp(min=least**2))
         self.count.fill_(len(batch))
-        self.shift.copy_(self.mean)
-        self.factor.copy_((self.var + self.eps).rsqrt())
+        self._refresh()
 
     @torch.no_grad()
     def update(self, observation: Tensor) -> None:
         """Merges ``(*batch, size)`` into the statistics (Chan et al. 1983).
 
         Raises:
-            UserError: for another size, NaN or infinity; the statistics are then as they were.
+            UserError: for another size, NaN or infinity; the statistics then stay as they were.
         """
-        check_size(observation, self.mean)
-        _check_finite(observation)
-        batch = observation.reshape(-1, observation.shape[-1]).double()
+        batch = self._checked(observation)
         n = batch.shape[0]
         total = self.count + n
         delta = batch.mean(0) - self.mean
@@ -96,6 +94,14 @@ class RunningNormaliser(nn.Module):
         self.var.add_(delta.square() * self.count * n / total).div_(total)
         self.mean.add_(delta * n / total)
         self.count.copy_(total)
+        self._refresh()
+
+    def _checked(self, observation: Tensor) -> Tensor:
+        check_size(observation, self.mean)
+        _check_finite(observation)
+        return observation.reshape(-1, observation.shape[-1]).double()
+
+    def _refresh(self) -> None:
         self.shift.copy_(self.mean)
         self.factor.copy_((self.var + self.eps).rsqrt())
 
@@ -111,7 +117,6 @@ def check_size(observation: Tensor, statistics: Tensor) -> None:
         UserError: for another size.
 
     Examples:
-        >>> import torch
         >>> check_size(torch.zeros(7, 1), torch.zeros(3))
         Traceback (most recent call last):
         giril_rl.errors.UserError: observations have shape (7, 1) where (*batch, 3) is needed.
@@ -123,6 +128,33 @@ def check_size(observation: Tensor, statistics: Tensor) -> None:
         )
 
 
+@contextmanager
+def running_statistics(module: nn.Module) -> Iterator[None]:
+    """Inside, ``module``'s batch normalisations use their running statistics and keep them as is.
+
+    Each sample's output then depends on that sample alone, which per-sample gradients need.
+
+    Args:
+        module: any module.
+
+    Examples:
+        >>> norm = nn.BatchNorm1d(1, affine=False, eps=0.0)
+        >>> with running_statistics(norm):
+        ...     norm(torch.tensor([[5.0], [7.0]])).flatten()
+        tensor([5., 7.])
+        >>> norm.training, norm.num_batches_tracked
+        (True, tensor(0))
+    """
+    training = [part for part in module.modules() if isinstance(part, _BatchNorm) and part.training]
+    for part in training:
+        part.training = False
+    try:
+        yield
+    finally:
+        for part in training:
+            part.training = True
+
+
 def _check_finite(observation: Tensor) -> None:
     finite = observation.isfinite()
     if not finite.all():
@@ -130,5 +162,5 @@ def _check_finite(observation: Tensor) -> None:
         value = observation[(*where, entry)].item()
         raise UserError(
             f"an observation is not finite: {value} at entry {entry} of the one at {where} in the "
-            "batch, where running statistics would keep it for ever; mend the environment or data."
+            "batch, and running statistics would keep it for ever; mend the environment or data."
         )

@@ -1,14 +1,15 @@
-"""Bodies for stacks of 84x84 frames: encoder, ICM's networks, and the convolutions they share."""
+"""Networks for stacks of 84x84 frames: GIRIL's encoder and prior, ICM's, the discriminators."""
 
 from __future__ import annotations
 
-from typing import TypeVar
+from typing import TypeVar, cast
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
+from torchrl.modules import MLP
 
 from giril_rl.errors import UserError
-from giril_rl.networks.joined import JoinedSequential
 
 SIDE = 84
 """Height and width of a frame."""
@@ -64,11 +65,11 @@ def xavier(network: Network) -> Network:
 def flat_frames(observation: Tensor, channels: int) -> Tensor:
     """Observations ``(*batch, channels, 84, 84)`` as ``(N, channels, 84, 84)``.
 
-    Floats, which go to convolutions as they are, have their channels last in memory then: a CPU's
-    convolutions and batch normalisations train in two thirds of the time.
+    Floats come back channels-last in memory: on a CPU, convolutions and batch normalisation then
+    train in two thirds of the time.
 
     Raises:
-        UserError: for another number of channels or another side.
+        UserError: for another number of channels or another frame size.
 
     Examples:
         >>> flat_frames(torch.zeros(2, 3, 4, 84, 84), 4).shape
@@ -87,10 +88,10 @@ def flat_frames(observation: Tensor, channels: int) -> Tensor:
 
 
 class PixelEncoder(nn.Module):
-    """GIRIL's encoder for pixels: mean and log-variance of z (paper, Table 2).
+    """GIRIL's encoder: mean and log-variance of z (paper, Table 2).
 
-    ``cat(s, s')`` through :func:`conv_stack`, then one linear layer for both; it is initialised as
-    the two layers that the paper has.
+    ``cat(s, s')`` goes through :func:`conv_stack`, then through one linear layer, which is
+    initialised as the paper's two separate ones.
 
     Args:
         actions: number of actions, the size of z.
@@ -111,37 +112,15 @@ class PixelEncoder(nn.Module):
             nn.init.xavier_uniform_(half)
         nn.init.zeros_(self.head.bias)
 
-    def forward(self, observation: Tensor, following: Tensor) -> Tensor:
+    def forward(self, observation: Tensor, next_observation: Tensor) -> Tensor:
         """``(*batch, 2 * actions)`` for s and s' scaled to [-1, 1], ``(*batch, 4, 84, 84)``."""
-        frames = [flat_frames(x, self.channels) for x in (observation, following)]
+        frames = [flat_frames(x, self.channels) for x in (observation, next_observation)]
         out = self.head(self.body(torch.cat(frames, 1)))
         return out.reshape(*observation.shape[:-3], *out.shape[1:])
 
 
-class PixelPrior(nn.Module):
-    """GIRIL's conditional prior for pixels: mean and log-variance of ``p(z | s)`` (paper, eq. 1).
-
-    Args:
-        actions: number of actions, the size of z.
-        channels: frames in an observation.
-
-    Examples:
-        >>> PixelPrior(6)(torch.zeros(2, 4, 84, 84)).shape
-        torch.Size([2, 12])
-    """
-
-    def __init__(self, actions: int, channels: int = 4) -> None:
-        super().__init__()
-        self.features = PixelFeatures(channels)
-        self.head = xavier(nn.Linear(FEATURES, 2 * actions))
-
-    def forward(self, observation: Tensor) -> Tensor:
-        """``(*batch, 2 * actions)`` for observations scaled to [-1, 1]."""
-        return self.head(self.features(observation))
-
-
 class PixelFeatures(nn.Module):
-    """ICM's features phi for pixels: :func:`conv_stack` of one observation (paper, Table 2).
+    """ICM's features phi: :func:`conv_stack` of one observation (paper, Table 2).
 
     Args:
         channels: frames in an observation.
@@ -162,12 +141,30 @@ class PixelFeatures(nn.Module):
         return features.reshape(*observation.shape[:-3], FEATURES)
 
 
-class InverseModel(JoinedSequential):
-    """ICM's logits of the action, from ``phi(s), phi(s')``: 2048 -> 64 -> actions (paper, Table 2).
+class PixelPrior(nn.Module):
+    """GIRIL's conditional prior: mean and log-variance of ``p(z | s)`` (paper, eq. 1).
 
     Args:
-        actions: number of actions.
-        features: size of phi.
+        actions: number of actions, the size of z.
+        channels: frames in an observation.
+
+    Examples:
+        >>> PixelPrior(6)(torch.zeros(2, 4, 84, 84)).shape
+        torch.Size([2, 12])
+    """
+
+    def __init__(self, actions: int, channels: int = 4) -> None:
+        super().__init__()
+        self.features = PixelFeatures(channels)
+        self.head = xavier(nn.Linear(FEATURES, 2 * actions))
+
+    def forward(self, observation: Tensor) -> Tensor:
+        """``(*batch, 2 * actions)`` for observations scaled to [-1, 1]."""
+        return self.head(self.features(observation))
+
+
+class InverseModel(MLP):
+    """ICM's action logits from ``phi(s), phi(s')``: 2048 -> 64 -> actions (paper, Table 2).
 
     Examples:
         >>> InverseModel(6)(torch.zeros(2, 1024), torch.zeros(2, 1024)).shape
@@ -175,16 +172,12 @@ class InverseModel(JoinedSequential):
     """
 
     def __init__(self, actions: int, features: int = FEATURES) -> None:
-        super().__init__(nn.Linear(2 * features, 64), nn.LeakyReLU(SLOPE), nn.Linear(64, actions))
+        super().__init__(2 * features, actions, num_cells=[64], activation_class=nn.LeakyReLU)
         xavier(self)
 
 
-class ForwardModel(JoinedSequential):
-    """ICM's ``phi_hat(s')``, from ``phi(s), a``: 1024 + actions -> 64 -> 1024 (paper, Table 2).
-
-    Args:
-        actions: number of actions.
-        features: size of phi.
+class ForwardModel(MLP):
+    """ICM's ``phi_hat(s')`` from ``phi(s), a``: 1024 + actions -> 64 -> 1024 (paper, Table 2).
 
     Examples:
         >>> ForwardModel(6)(torch.zeros(2, 1024), torch.zeros(2, 6)).shape
@@ -192,7 +185,81 @@ class ForwardModel(JoinedSequential):
     """
 
     def __init__(self, actions: int, features: int = FEATURES) -> None:
-        super().__init__(
-            nn.Linear(features + actions, 64), nn.LeakyReLU(SLOPE), nn.Linear(64, features)
-        )
+        sizes = features + actions, features
+        super().__init__(*sizes, num_cells=[64], activation_class=nn.LeakyReLU)
         xavier(self)
+
+
+class PixelPairNetwork(nn.Module):
+    """The encoder's convolutions on the frames plus, for each action, one constant plane.
+
+    A constant plane looks the same under every position of an unpadded kernel. So it adds its
+    value times the sum of its kernel, and the planes themselves are never made.
+
+    Args:
+        actions: number of actions, the size of the action encoding.
+        channels: frames in an observation.
+        head: the layers after the last convolution's 64x4x4.
+
+    Examples:
+        >>> network = PixelPairNetwork(6, 4, nn.Flatten())
+        >>> network(torch.zeros(2, 4, 84, 84), torch.zeros(2, 6)).shape
+        torch.Size([2, 1024])
+    """
+
+    def __init__(self, actions: int, channels: int, *head: nn.Module) -> None:
+        super().__init__()
+        self.channels = channels
+        stack = conv_stack(channels + actions)
+        self.first = cast(nn.Conv2d, stack[0])
+        self.rest = stack[1:-1]
+        self.head = xavier(nn.Sequential(*head))
+
+    def forward(self, observation: Tensor, encoding: Tensor) -> Tensor:
+        """The head's output ``(*batch, features)``.
+
+        Args:
+            observation: scaled to [-1, 1], ``(*batch, channels, 84, 84)``.
+            encoding: the encoded action, ``(*batch, actions)``.
+        """
+        frames = flat_frames(observation, self.channels)
+        weight = self.first.weight
+        kernel_sums = weight[:, self.channels :].sum((-2, -1))
+        planes = encoding.reshape(-1, encoding.shape[-1]) @ kernel_sums.T
+        out = F.conv2d(frames, weight[:, : self.channels], self.first.bias, stride=2)
+        out = self.head(self.rest(out + planes[..., None, None]))
+        return out.reshape(*observation.shape[:-3], *out.shape[1:])
+
+
+class PixelDiscriminator(PixelPairNetwork):
+    """GAIL's discriminator: one logit (paper, appendix).
+
+    Args:
+        actions: number of actions.
+        out_features: numbers per pair.
+        channels: frames in an observation.
+
+    Examples:
+        >>> PixelDiscriminator(6)(torch.zeros(2, 4, 84, 84), torch.zeros(2, 6)).shape
+        torch.Size([2, 1])
+    """
+
+    def __init__(self, actions: int, out_features: int = 1, channels: int = 4) -> None:
+        super().__init__(actions, channels, nn.Flatten(), nn.Linear(FEATURES, out_features))
+
+
+class PixelBottleneck(PixelPairNetwork):
+    """VAIL's encoder: mean and log-variance of z, by a 4x4 convolution (paper, appendix).
+
+    Args:
+        actions: number of actions.
+        latent: size of z.
+        channels: frames in an observation.
+
+    Examples:
+        >>> PixelBottleneck(6, latent=8)(torch.zeros(2, 4, 84, 84), torch.zeros(2, 6)).shape
+        torch.Size([2, 16])
+    """
+
+    def __init__(self, actions: int, latent: int, channels: int = 4) -> None:
+        super().__init__(actions, channels, nn.Conv2d(64, 2 * latent, 4), nn.Flatten())

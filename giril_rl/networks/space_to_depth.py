@@ -1,4 +1,4 @@
-"""The first convolution on frames, without its waste."""
+"""The first convolution on frames, computed in blocks."""
 
 from __future__ import annotations
 
@@ -8,16 +8,18 @@ from torch import Tensor, nn
 
 from giril_rl.errors import UserError
 
+_WORDS = {2: torch.int16, 4: torch.int32, 8: torch.int64}
+"""The integer as wide as a block's row of bytes."""
+
 
 class SpaceToDepthConv(nn.Conv2d):
-    """A convolution of bytes whose kernel is a multiple of its stride, scaled by ``1 / 255``.
+    """A convolution of bytes, scaled by ``1 / 255``, whose kernel is a multiple of its stride.
 
-    ``Conv2d(4, 32, 8, stride=4)`` of four frames leaves most of a CPU's vector unit idle: four
-    channels are few. Dealt out in blocks of the stride, the frames have 64 channels, and the same
-    sum is a 2x2 convolution of stride 1. Weights keep ``Conv2d``'s shape and names, and the numbers
-    are those of ``conv(frames / 255)`` to rounding. PPO's update of the whole network takes 0.6 of
-    the time (``tests/benchmarks/atari_training.py`` has the loop). Frames that are used many times
-    are dealt out once.
+    ``Conv2d(4, 32, 8, stride=4)`` of four frames leaves most of a CPU's vector unit idle. Cut into
+    blocks of the stride by :func:`deal`, the frames have 64 channels, and the same sum is a 2x2
+    convolution of stride 1. Weights keep ``Conv2d``'s shape and names, and results equal
+    ``conv(frames / 255)`` up to rounding. PPO's update of the whole network takes 0.6 of the time
+    (``tests/benchmarks/atari_training.py`` measures it).
 
     Args:
         in_channels: frames in an observation.
@@ -25,8 +27,10 @@ class SpaceToDepthConv(nn.Conv2d):
         kernel_size: side of the kernel, a multiple of ``stride``.
         stride: stride, which divides the frame's sides.
 
+    Raises:
+        UserError: for a kernel that is no multiple of the stride.
+
     Examples:
-        >>> import torch
         >>> frames = torch.randint(0, 256, (2, 4, 84, 84), dtype=torch.uint8)
         >>> conv = SpaceToDepthConv(4, 32, 8, stride=4)
         >>> plain = F.conv2d(frames / 255, conv.weight, conv.bias, stride=4)
@@ -45,7 +49,7 @@ class SpaceToDepthConv(nn.Conv2d):
         self.block = stride
 
     def forward(self, dealt: Tensor) -> Tensor:
-        """``(N, out_channels, ...)`` for frames that :func:`deal` dealt out by the stride."""
+        """``(N, out_channels, ...)`` for frames that :func:`deal` cut into blocks of the stride."""
         out, side = self.out_channels, self.weight.shape[-1]
         blocks = side // self.block
         weight = (self.weight / 255).unflatten(3, (blocks, -1)).unflatten(2, (blocks, -1))
@@ -56,19 +60,16 @@ class SpaceToDepthConv(nn.Conv2d):
 def deal(frames: Tensor, block: int) -> Tensor:
     """Bytes ``(N, c, h, w)`` as ``(N, h / block, w / block, c * block * block)``.
 
-    Channels last in memory, which is what the convolution wants. A block's row is moved as one
-    word, and bytes are moved rather than floats: each is a fourth of the work.
+    The result is channels-last in memory, as the convolution prefers. Moving a block's row as one
+    word, and bytes rather than floats, saves three quarters of the work each.
 
     Examples:
         >>> deal(torch.zeros(2, 4, 84, 84, dtype=torch.uint8), 4).shape
         torch.Size([2, 21, 21, 64])
     """
-    words = frames.contiguous().view(_WORDS[block]) if block in _WORDS else None
-    if words is None:
+    if block not in _WORDS:
         rows = frames.unflatten(3, (-1, block)).unflatten(2, (-1, block))
         return rows.permute(0, 2, 4, 1, 3, 5).flatten(3)
+    words = frames.contiguous().view(_WORDS[block])
     moved = words.unflatten(2, (-1, block)).permute(0, 2, 4, 1, 3).contiguous()
     return moved.view(frames.dtype).flatten(3)
-
-
-_WORDS = {2: torch.int16, 4: torch.int32, 8: torch.int64}

@@ -1,32 +1,26 @@
-"""Bodies for vector observations: two hidden layers of 100, tanh (paper, section 5.2)."""
+"""Multilayer perceptrons for vector observations: two hidden layers of 100, tanh (section 5.2)."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
 from torch import nn
+from torchrl.modules import MLP
 
 
-def mlp(in_features: int, out_features: int, hidden: Sequence[int] = (100, 100)) -> nn.Sequential:
-    """A fully connected network with tanh between its layers and a linear output.
+def mlp(in_features: int, out_features: int, hidden: Sequence[int] = (100, 100)) -> MLP:
+    """TorchRL's ``MLP`` with tanh between its layers and a linear output.
+
+    It concatenates several inputs along their last dimension.
 
     Args:
-        in_features: size of the last dimension of the input.
-        out_features: size of the last dimension of the output.
+        in_features: total size of the inputs' last dimensions.
+        out_features: size of the output's last dimension.
         hidden: sizes of the hidden layers; the paper uses two of 100.
-
-    Returns:
-        A module mapping ``(*batch, in_features)`` to ``(*batch, out_features)``.
 
     Examples:
         >>> import torch
-        >>> mlp(5, 1)(torch.zeros(7, 5)).shape
+        >>> mlp(5, 1)(torch.zeros(7, 3), torch.zeros(7, 2)).shape
         torch.Size([7, 1])
     """
-    layers: list[nn.Module] = []
-    size = in_features
-    for width in hidden:
-        layers += [nn.Linear(size, width), nn.Tanh()]
-        size = width
-    layers.append(nn.Linear(size, out_features))
-    return nn.Sequential(*layers)
+    return MLP(in_features, out_features, num_cells=list(hidden), activation_class=nn.Tanh)

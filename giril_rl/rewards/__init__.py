@@ -1,4 +1,4 @@
-"""What a transition is worth: learned reward modules, how they are trained, and controls."""
+"""Rewards: one file a method, each with its settings, maths, module, loss and registry entry."""
 
 from giril_rl.rewards.actions import ActionEncoder
 from giril_rl.rewards.adversarial import (
@@ -7,42 +7,66 @@ from giril_rl.rewards.adversarial import (
     discriminator_loss,
     gradient_penalty,
 )
-from giril_rl.rewards.affine import AffineReward
-from giril_rl.rewards.bottleneck import BottleneckReward
-from giril_rl.rewards.bottleneck_loss import BottleneckLoss
-from giril_rl.rewards.constant import ConstantReward
-from giril_rl.rewards.copy import CopyReward
-from giril_rl.rewards.curiosity import CuriosityReward, feature_error
-from giril_rl.rewards.curiosity_loss import CuriosityRewardLoss, FeatureTraining
-from giril_rl.rewards.discriminator import DiscriminatorReward, DiscriminatorScaling
-from giril_rl.rewards.discriminator_loss import DiscriminatorLoss
-from giril_rl.rewards.equations import blend_action, reconstruction_error
-from giril_rl.rewards.factored import factored_error
-from giril_rl.rewards.fitting import fit
-from giril_rl.rewards.generative import GenerativeReward, Prior
-from giril_rl.rewards.generative_loss import (
-    GenerativeRewardLoss,
-    action_term,
-    gaussian_kl,
+from giril_rl.rewards.bottleneck import (
+    BottleneckConfig,
+    BottleneckLoss,
+    BottleneckReward,
+    bottleneck_reward,
 )
-from giril_rl.rewards.noise import NoiseReward
-from giril_rl.rewards.pixel_scaler import PixelScaler
-from giril_rl.rewards.scaler import ObservationScaler, ScalingRule
-from giril_rl.rewards.transition_loss import TransitionLoss
+from giril_rl.rewards.controls import (
+    AffineReward,
+    ConstantReward,
+    CopyReward,
+    NoiseReward,
+    copy_reward,
+)
+from giril_rl.rewards.curiosity import (
+    CuriosityConfig,
+    CuriosityReward,
+    CuriosityRewardLoss,
+    FeatureTraining,
+    curiosity_reward,
+    feature_error,
+)
+from giril_rl.rewards.discriminator import (
+    AdversarialConfig,
+    DiscriminatorLoss,
+    DiscriminatorReward,
+    DiscriminatorScaling,
+    discriminator_reward,
+)
+from giril_rl.rewards.factored import factored_error
+from giril_rl.rewards.fitting import TransitionLoss, fit
+from giril_rl.rewards.generative import (
+    GenerativeConfig,
+    GenerativeReward,
+    GenerativeRewardLoss,
+    Prior,
+    action_term,
+    blend_action,
+    gaussian_kl,
+    generative_reward,
+    reconstruction_error,
+)
+from giril_rl.rewards.scaler import ObservationScaler, PixelScaler, ScalingRule
 
 __all__ = [
     "ActionEncoder",
+    "AdversarialConfig",
     "AffineReward",
+    "BottleneckConfig",
     "BottleneckLoss",
     "BottleneckReward",
     "ConstantReward",
     "CopyReward",
+    "CuriosityConfig",
     "CuriosityReward",
     "CuriosityRewardLoss",
     "DiscriminatorLoss",
     "DiscriminatorReward",
     "DiscriminatorScaling",
     "FeatureTraining",
+    "GenerativeConfig",
     "GenerativeReward",
     "GenerativeRewardLoss",
     "NoiseReward",
@@ -55,11 +79,16 @@ __all__ = [
     "action_term",
     "adversarial_reward",
     "blend_action",
+    "bottleneck_reward",
+    "copy_reward",
+    "curiosity_reward",
     "discriminator_loss",
+    "discriminator_reward",
     "factored_error",
     "feature_error",
     "fit",
     "gaussian_kl",
+    "generative_reward",
     "gradient_penalty",
     "reconstruction_error",
 ]

@@ -1,4 +1,4 @@
-"""Actions as the real vectors that encoder and decoder speak of."""
+"""Encodes actions as real vectors."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from giril_rl.networks.action_bounds import affine_map, single_action_spec
 
 
 class ActionEncoder(nn.Module):
-    """Turns an environment's actions into action codes of shape ``(*batch, size)``.
+    """Encodes an environment's actions as vectors of shape ``(*batch, size)``.
 
     - Discrete, integers ``(*batch,)``: one-hot, as floats. One-hot actions: as floats.
     - Box ``(*batch, size)``: clamped to the bounds, as the simulator does before it acts, then
-      mapped affinely from the bounds to [-1, 1]; a dimension without two finite bounds keeps its
+      mapped affinely from the bounds to [-1, 1]. A dimension without two finite bounds keeps its
       unit.
 
     Args:
@@ -23,8 +23,8 @@ class ActionEncoder(nn.Module):
             Composite of nothing else.
 
     Raises:
-        UserError: for a spec of another kind, or actions of another encoding than the spec's. Only
-            their dtype and shape are looked at, so that the encoder can be recorded as a graph.
+        UserError: for an unsupported spec, or actions that do not fit it. Only dtype and shape are
+            checked, so that the encoder can be recorded as a graph.
 
     Examples:
         >>> from torchrl.data import Bounded
@@ -65,13 +65,12 @@ class ActionEncoder(nn.Module):
         return () if self.discrete and not self.one_hot else (self.size,)
 
     def batch(self, action: Tensor) -> torch.Size:
-        """The leading shape of actions, whose dtype and width are checked.
+        """The leading shape of actions.
 
         Raises:
-            UserError: for another dtype or width.
+            UserError: for another dtype or width than the spec's.
 
         Examples:
-            >>> from torchrl.data import OneHot
             >>> ActionEncoder(OneHot(3)).batch(torch.tensor([2, 0]))
             Traceback (most recent call last):
             giril_rl.errors.UserError: actions are torch.int64 of shape (2,): the reward reads
@@ -92,7 +91,7 @@ class ActionEncoder(nn.Module):
         return action.shape[: action.ndim - len(self.event)]
 
     def check_values(self, action: Tensor) -> None:
-        """Refuses what has the right shape and is no action. It looks at values, so call it once.
+        """Refuses values of the right shape that are no action. It reads values: call it once.
 
         Raises:
             UserError: for integers outside the spec, or vectors that are not one-hot.
@@ -120,24 +119,24 @@ class ActionEncoder(nn.Module):
             )
 
     def forward(self, action: Tensor) -> Tensor:
-        """The action codes ``(*batch, size)``."""
+        """The encoded actions ``(*batch, size)``."""
         self.batch(action)
         if self.one_hot:
             return action.to(torch.get_default_dtype())
         if self.discrete:
-            # Not F.one_hot, which looks at the values and so cannot be recorded as a graph.
+            # F.one_hot reads the values, so it cannot be recorded as a graph.
             zeros = torch.zeros(*action.shape, self.size, device=action.device)
             return zeros.scatter(-1, action.long().unsqueeze(-1), 1.0)
         clamped = torch.clamp(action.to(self.low.dtype), self.low, self.high)
         return (clamped - self.offset) * self.scale
 
     def target(self, action: Tensor) -> Tensor:
-        """What the encoder's latent is fitted to: class indices if discrete, else the code."""
+        """What a model that predicts the action is fitted to: class indices, or the encoding."""
         if self.discrete and not self.one_hot:
             self.batch(action)
             return action.long()
-        code = self(action)
-        return code.argmax(-1) if self.one_hot else code
+        encoding = self(action)
+        return encoding.argmax(-1) if self.one_hot else encoding
 
     def extra_repr(self) -> str:
         """Shows kind and size when printed."""

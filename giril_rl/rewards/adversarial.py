@@ -1,8 +1,8 @@
-"""The mathematics of adversarial imitation, on the discriminator's logit.
+"""The maths of adversarial imitation, on the discriminator's logit: labels, rewards, penalty.
 
-One convention throughout: ``D(s, a) = sigmoid(logit)`` is the probability that the pair is the
-**expert's** (label 1), and ``1 - D`` that it is the policy's (label 0). Ho and Ermon (2016) label
-the other way round; ``docs/methods/gail.md`` translates.
+Labels, everywhere in this package: ``D(s, a) = sigmoid(logit)`` is the probability that the pair is
+the **expert's** (label 1), and ``1 - D`` that it is the policy's (label 0). Ho and Ermon (2016)
+label the other way round; ``docs/methods/gail.md`` translates.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ RewardForm = Literal["positive", "negative", "log_ratio", "reversed"]
 
 
 def discriminator_loss(expert: Tensor, policy: Tensor) -> tuple[Tensor, Tensor]:
-    """Binary cross-entropy: the means of ``-log D`` and of ``-log(1 - D)``, to be added.
+    """Binary cross-entropy: the means of ``-log D`` (expert) and of ``-log(1 - D)`` (policy).
 
-    Each set has its own mean, so that their sizes may differ and both weigh the same.
+    Add them. Each set has its own mean, so that both weigh the same whatever their sizes.
 
     Args:
         expert: logits of the expert's pairs, any shape.
@@ -41,7 +41,7 @@ def discriminator_loss(expert: Tensor, policy: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def adversarial_reward(logit: Tensor, form: RewardForm) -> Tensor:
-    """What a pair is worth to the policy, of the logit's shape.
+    """The policy's reward for a pair, of the logit's shape.
 
     ===============  ====================  =========  ========================================
     form             with D = P(expert)    range      what it pays for besides likeness
@@ -81,7 +81,7 @@ def adversarial_reward(logit: Tensor, form: RewardForm) -> Tensor:
 def interpolated(expert: Tensor, policy: Tensor, weight: Tensor) -> Tensor:
     """Points between pairs of the two sets: ``weight * expert + (1 - weight) * policy``.
 
-    The smaller set is gone through again until it is as long as the larger.
+    The smaller set is repeated until it is as long as the larger.
 
     Args:
         expert: ``(n, *features)``.
@@ -101,11 +101,11 @@ def interpolated(expert: Tensor, policy: Tensor, weight: Tensor) -> Tensor:
 def gradient_penalty(score: Callable[..., Tensor], points: Sequence[Tensor]) -> Tensor:
     """Mean of ``(‖gradient of score‖ - 1)^2`` (Gulrajani et al. 2017, arXiv 1704.00028, eq. 3).
 
-    The norm is taken over the gradients with respect to all points of a pair together.
+    The norm is over the gradients with respect to all tensors in ``points`` together.
 
     Args:
         score: called with ``points``; one number per pair, whose shape is that of the batch.
-        points: tensors ``(*batch, *features)``, such as observations and action codes.
+        points: tensors ``(*batch, *features)``, such as observations and encoded actions.
 
     Returns:
         A scalar, differentiable with respect to the parameters of ``score``.
@@ -130,7 +130,7 @@ def dual_step(beta: Tensor, kl: Tensor, limit: float, step: float) -> Tensor:
         beta: the multiplier of the constraint ``kl <= limit``.
         kl: the constrained quantity, in nats.
         limit: the information constraint I_c, in nats.
-        step: how far the multiplier moves for a violation of one nat.
+        step: change of the multiplier for a violation of one nat.
 
     Examples:
         >>> dual_step(torch.tensor(0.25), torch.tensor([2.5, 0.0]), limit=0.5, step=1.0)

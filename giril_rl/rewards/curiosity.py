@@ -1,26 +1,65 @@
-"""CDIL's reward: the intrinsic curiosity module (ICM) fitted to a demonstration."""
+"""CDIL: the error of the intrinsic curiosity module (ICM) trained on the demonstration.
+
+The reward is :func:`feature_error` of ICM's forward model, in :class:`CuriosityReward`.
+:class:`CuriosityRewardLoss` trains it by ``L_I + L_F`` (paper, appendix on CDIL).
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, cast, get_args
 
 from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase, dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.data import TensorSpec
+from torchrl.envs import EnvBase
 
-from giril_rl.networks.joined import JoinedSequential
+from giril_rl.config.schema import knob
+from giril_rl.errors import UserError
 from giril_rl.networks.pixels import ForwardModel, InverseModel, PixelFeatures
 from giril_rl.networks.vectors import mlp
 from giril_rl.rewards.actions import ActionEncoder
-from giril_rl.rewards.chunks import per_transition
-from giril_rl.rewards.keys import REWARD_KEYS, TRANSITION_KEYS, check_keys
-from giril_rl.rewards.pixel_scaler import PixelScaler
-from giril_rl.rewards.scaler import ObservationScaler, ScalingRule
-from giril_rl.rewards.transitions import check_output, check_transitions, read
+from giril_rl.rewards.fitting import Reduction, TransitionLoss
+from giril_rl.rewards.generative import action_term
+from giril_rl.rewards.method import RED, Method, register
+from giril_rl.rewards.scaler import ObservationScaler, PixelScaler, ScalingRule
+from giril_rl.rewards.transitions import (
+    REWARD_KEYS,
+    TRANSITION_KEYS,
+    TransitionReward,
+    check_output,
+    check_transitions,
+    observation_shape,
+)
 from giril_rl.runs.pretrained import Pretrained, remembered
-from giril_rl.runs.randomness import seeded
+from giril_rl.runs.randomness import seeded, stream_seed
+
+FeatureTraining = Literal["inverse", "both", "none"]
+
+
+@dataclass
+class CuriosityConfig:
+    """CDIL's intrinsic curiosity module and the reward made of it."""
+
+    features: str = knob(
+        "inverse",
+        "what trains the features: L_I alone, L_I + L_F, or nothing (random, as released)",
+        choices=("inverse", "both", "none"),
+    )
+    scale: float = knob(1.0, "lambda, the weight of the squared error", low=0, low_open=True)
+    normalise: str = knob(
+        "standardise",
+        "observation rule of the reward model",
+        choices=("demo_range", "standardise", "raw", "pixels"),
+    )
+    clamp: bool = knob(True, "clamp observations to [-1, 1], those of normalise=raw too")
+    hidden: list[int] = knob([100, 100], "layers of the features (tanh); [] takes none", low=1)
+    model_hidden: list[int] = knob(
+        [100], "hidden layers of inverse and forward model (tanh)", low=1
+    )
+    seed: int | None = knob(None, "seed of the reward model; null takes the run's seed", low=0)
 
 
 def feature_error(predicted: Tensor, features: Tensor) -> Tensor:
@@ -40,23 +79,24 @@ def feature_error(predicted: Tensor, features: Tensor) -> Tensor:
     return (predicted - features).square().sum(-1)
 
 
-class CuriosityReward(Pretrained, TensorDictModuleBase):
+class CuriosityReward(Pretrained, TransitionReward):
     """ICM: ``r = lambda * ||forward(phi(s), a) - phi(s')||^2``, the error in feature space.
 
-    Features are those of observations after the scaler. The inverse model, which reads the action
-    back from ``phi(s)`` and ``phi(s')``, takes no part in the reward: it is what the features are
-    learned by. The reward is deterministic.
+    Features are those of scaled observations. The inverse model, which predicts the action from
+    ``phi(s)`` and ``phi(s')``, trains the features; the reward does not use it. The reward is
+    deterministic.
 
-    Reads observation ``(*batch, d)``, action and next observation, writes one reward per
-    transition, ``(*batch, 1)``, without averaging. Train it with
-    :class:`~giril_rl.rewards.CuriosityRewardLoss`, after ``reward.scaler.fit(observations)``.
+    Reads observation ``(*batch, d)``, or frames, action and next observation. Writes one reward per
+    transition, ``(*batch, 1)``. Train it with :class:`~giril_rl.rewards.CuriosityRewardLoss`, after
+    ``reward.scaler.fit(observations)``.
 
     Args:
         features: phi, maps a scaled observation to its features.
-        inverse_model: called with ``phi(s)`` and ``phi(s')``, gives the action's logits or code.
-        forward_model: called with ``phi(s)`` and the action's code, predicts ``phi(s')``.
+        inverse_model: called with ``phi(s)`` and ``phi(s')``, predicts the action: its logits if it
+            is discrete, else its encoding.
+        forward_model: called with ``phi(s)`` and the encoded action, predicts ``phi(s')``.
         scaler: applied to both observations.
-        actions: turns actions into codes.
+        actions: encodes actions.
         scale: lambda.
         in_keys: keys of observation, action and next observation.
         out_keys: where the reward is written, one key.
@@ -87,12 +127,8 @@ class CuriosityReward(Pretrained, TensorDictModuleBase):
         in_keys: Sequence[NestedKey] = TRANSITION_KEYS,
         out_keys: Sequence[NestedKey] = REWARD_KEYS,
     ) -> None:
-        super().__init__()
-        check_keys(
-            "a curiosity reward", ("observation", "action", "next observation"), in_keys, out_keys
-        )
-        self.in_keys: list[NestedKey] = list(in_keys)
-        self.out_keys: list[NestedKey] = list(out_keys)
+        roles = "observation", "action", "next observation"
+        super().__init__("a curiosity reward", roles, in_keys, out_keys)
         self.features = features
         self.inverse_model = inverse_model
         self.forward_model = forward_model
@@ -116,20 +152,20 @@ class CuriosityReward(Pretrained, TensorDictModuleBase):
         in_keys: Sequence[NestedKey] = TRANSITION_KEYS,
         out_keys: Sequence[NestedKey] = REWARD_KEYS,
     ) -> CuriosityReward:
-        """The paper's bodies for vector observations, initialised from ``seed`` alone.
+        """The paper's networks for vector observations, initialised from ``seed`` alone.
 
         Args:
             observation_dim: size of the observation.
             action_spec: the environment's action spec.
-            hidden: layers of phi, each with tanh after it, so that features lie in (-1, 1); with
-                none, the features are the scaled observation itself.
+            hidden: layers of phi, each followed by tanh, so that features lie in (-1, 1). With no
+                layers, the features are the scaled observation itself.
             model_hidden: hidden layers (tanh) of the inverse and the forward model.
             scale: lambda.
             normalise: the scaler's rule.
             clamp: clamp the scaled observations to [-1, 1].
-            seed: seed of the weights. The global random state is neither read nor changed.
-            in_keys: keys of observation, action and next observation.
-            out_keys: where the reward is written, one key.
+            seed: seed of the weights. The global random state stays as it is.
+            in_keys: see the class.
+            out_keys: see the class.
 
         Raises:
             UserError: for an unknown rule or kind of action.
@@ -140,8 +176,8 @@ class CuriosityReward(Pretrained, TensorDictModuleBase):
             features: nn.Module = nn.Identity()
             if hidden:
                 features = nn.Sequential(*mlp(observation_dim, size, hidden[:-1]), nn.Tanh())
-            inverse_model = JoinedSequential(*mlp(2 * size, actions.size, model_hidden))
-            forward_model = JoinedSequential(*mlp(size + actions.size, size, model_hidden))
+            inverse_model = mlp(2 * size, actions.size, model_hidden)
+            forward_model = mlp(size + actions.size, size, model_hidden)
         return cls(
             features,
             inverse_model,
@@ -165,21 +201,10 @@ class CuriosityReward(Pretrained, TensorDictModuleBase):
         in_keys: Sequence[NestedKey] = TRANSITION_KEYS,
         out_keys: Sequence[NestedKey] = REWARD_KEYS,
     ) -> CuriosityReward:
-        """The paper's bodies for stacks of 84x84 frames (Table 2), initialised from ``seed`` alone.
+        """The paper's networks for ``channels`` frames of 84x84 (Table 2); see `for_vectors`.
 
-        Batch normalisation makes the reward depend on its batch while the module is in training
-        mode; :class:`~giril_rl.transforms.IntrinsicReward` calls it in eval mode.
-
-        Args:
-            action_spec: the environment's action spec.
-            channels: frames in an observation.
-            scale: see :meth:`for_vectors`, as for all others.
-            seed: seed of the weights.
-            in_keys: keys of observation, action and next observation.
-            out_keys: where the reward is written, one key.
-
-        Raises:
-            UserError: for an unknown kind of action.
+        In training mode batch normalisation makes a reward depend on its batch.
+        :class:`~giril_rl.transforms.IntrinsicReward` calls the module in eval mode.
         """
         actions = ActionEncoder(action_spec)
         with seeded(seed):
@@ -197,28 +222,148 @@ class CuriosityReward(Pretrained, TensorDictModuleBase):
         )
 
     def invert(self, features: Tensor, next_features: Tensor) -> Tensor:
-        """``a_hat``: logits of a discrete action, the code of a continuous one."""
+        """``a_hat``: logits of a discrete action, the encoding of a continuous one."""
         return self.inverse_model(features, next_features)
 
-    def predict(self, features: Tensor, action_code: Tensor) -> Tensor:
-        """``phi_hat(s')`` from ``phi(s)`` and the action's code."""
-        return self.forward_model(features, action_code)
+    def predict(self, features: Tensor, encoding: Tensor) -> Tensor:
+        """``phi_hat(s')`` from ``phi(s)`` and the encoded action."""
+        return self.forward_model(features, encoding)
 
-    def forward_error(self, features: Tensor, action_code: Tensor, next_features: Tensor) -> Tensor:
+    def forward_error(self, features: Tensor, encoding: Tensor, next_features: Tensor) -> Tensor:
         """:func:`feature_error` of :meth:`predict`, whose shape is checked."""
-        predicted = self.predict(features, action_code)
+        predicted = self.predict(features, encoding)
         check_output("the forward model", predicted, next_features.shape)
         return feature_error(predicted, next_features)
 
-    @dispatch(auto_batch_size=False)
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes each transition's reward."""
-        transitions = read(tensordict, self.in_keys)
-        check_transitions(self.scaler, self.actions, *transitions)
-        error = per_transition(self._error, transitions, self.scaler.event_dims)
-        return tensordict.set(self.out_keys[0], self.scale * error.unsqueeze(-1))
-
-    def _error(self, observation: Tensor, action: Tensor, following: Tensor) -> Tensor:
+    def value(self, *transitions: Tensor) -> Tensor:
+        """Lambda times the error of each transition."""
+        observation, action, next_observation = transitions
         features = self.features(self.scaler(observation))
-        next_features = self.features(self.scaler(following))
-        return self.forward_error(features, self.actions(action), next_features)
+        next_features = self.features(self.scaler(next_observation))
+        return self.scale * self.forward_error(features, self.actions(action), next_features)
+
+
+class CuriosityRewardLoss(TransitionLoss):
+    """``L_I + L_F`` of the paper's appendix on CDIL, to be minimised.
+
+    - ``loss_inverse``: error of the action that the inverse model predicts from ``phi(s)`` and
+      ``phi(s')``, by :func:`~giril_rl.rewards.action_term`: cross-entropy for discrete actions,
+      mean squared error for continuous ones.
+    - ``loss_forward``: :func:`~giril_rl.rewards.curiosity.feature_error` of the forward model.
+
+    Inverse and forward model are always trained. The paper does not say which loss trains phi:
+
+    - ``"inverse"``: ``L_I`` alone, as features are "learned with a self-supervised inverse
+      dynamics model". ``L_F`` sees phi as fixed and has ``theta_F`` only.
+    - ``"both"``: the sum's gradient, if phi counts as part of ``theta_I`` in the joint objective.
+      ``L_F`` then shrinks the features, since small ones are easily predicted.
+    - ``"none"``: phi keeps its random weights, as in the authors' released code.
+
+    Args:
+        reward: the module to train; its parameters are this loss's parameters.
+        features: what trains phi.
+        reduction: ``"mean"``, ``"sum"`` or ``"none"`` over transitions.
+        functional: see :class:`~giril_rl.rewards.TransitionLoss`.
+
+    Raises:
+        UserError: for an unknown ``features`` or ``reduction``.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl.data import Bounded
+        >>> reward = CuriosityReward.for_vectors(2, Bounded(-1, 1, shape=(1,)), normalise="raw")
+        >>> loss = CuriosityRewardLoss(reward)
+        >>> s, a = torch.zeros(4, 2), torch.zeros(4, 1)
+        >>> batch = TensorDict({"observation": s, "action": a, "next": {"observation": s}}, [4])
+        >>> sorted(loss(batch).keys())
+        ['loss_forward', 'loss_inverse']
+    """
+
+    reward: CuriosityReward
+
+    def __init__(
+        self,
+        reward: CuriosityReward,
+        *,
+        features: FeatureTraining = "inverse",
+        reduction: Reduction = "mean",
+        functional: bool = False,
+    ) -> None:
+        super().__init__(reward, reduction=reduction, functional=functional)
+        if features not in get_args(FeatureTraining):
+            raise UserError(f"features={features!r} is unknown: choose inverse, both or none.")
+        self.features: FeatureTraining = features
+
+    @property
+    def out_keys(self) -> list[NestedKey]:
+        """Names of the two terms."""
+        return ["loss_inverse", "loss_forward"]
+
+    def terms(
+        self, observation: Tensor, action: Tensor, next_observation: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """The two terms; ``features`` decides which of them train phi."""
+        reward = self.reward
+        check_transitions(reward.scaler, reward.actions, observation, action, next_observation)
+        phi = reward.features(reward.scaler(observation))
+        next_phi = reward.features(reward.scaler(next_observation))
+        if self.features == "none":
+            phi, next_phi = phi.detach(), next_phi.detach()
+        inverse = action_term(reward.invert(phi, next_phi), reward.actions.target(action))
+        if self.features == "inverse":
+            phi, next_phi = phi.detach(), next_phi.detach()
+        return inverse, reward.forward_error(phi, reward.actions(action), next_phi)
+
+
+def curiosity_reward(
+    settings: CuriosityConfig, env: EnvBase, pairs: TensorDictBase, *, seed: int
+) -> CuriosityReward:
+    """CDIL's reward, untrained, its scaler fitted to ``pairs``.
+
+    Args:
+        settings: its settings; ``features`` is the loss's and ``seed`` is the caller's to resolve.
+        env: the environment, for its specs.
+        pairs: the demonstrated transitions to learn from.
+        seed: seed of the weights. The global random state stays as it is.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl.envs import GymEnv
+        >>> pairs = TensorDict({"observation": torch.rand(9, 4)}, [9])
+        >>> curiosity_reward(CuriosityConfig(), GymEnv("CartPole-v1"), pairs, seed=0).scaler
+        ObservationScaler(4, rule='standardise', clamp=True)
+    """
+    frames, size = observation_shape(env)
+    seed = stream_seed("reward", seed)
+    if frames:
+        reward = CuriosityReward.for_pixels(
+            env.action_spec, channels=frames, scale=settings.scale, seed=seed
+        )
+    else:
+        reward = CuriosityReward.for_vectors(
+            size,
+            env.action_spec,
+            hidden=settings.hidden,
+            model_hidden=settings.model_hidden,
+            scale=settings.scale,
+            normalise=cast(ScalingRule, settings.normalise),
+            clamp=settings.clamp,
+            seed=seed,
+        )
+    reward.scaler.fit(pairs.get("observation"))
+    return reward
+
+
+register(
+    Method(
+        "cdil",
+        "CDIL",
+        RED,
+        settings=CuriosityConfig,
+        build=curiosity_reward,
+        loss=lambda reward, settings: CuriosityRewardLoss(reward, features=settings.features),
+        rank=1,
+    )
+)

@@ -1,48 +1,95 @@
-"""GAIL's reward: how much a pair looks like the expert's to a discriminator."""
+"""GAIL: a discriminator's logit of how much a pair looks like the expert's.
+
+Labels, forms of the reward and the gradient penalty are pure functions in
+:mod:`giril_rl.rewards.adversarial`. :class:`DiscriminatorReward` applies them to a network, and
+:class:`DiscriminatorLoss` trains it.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Literal, get_args
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal, cast, get_args
 
 import torch
-from tensordict import TensorDictBase
-from tensordict.nn import TensorDictModuleBase, dispatch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.data import TensorSpec
+from torchrl.envs import EnvBase
 
+from giril_rl.config.schema import COMPILE, knob
 from giril_rl.errors import UserError
-from giril_rl.networks.joined import JoinedSequential
-from giril_rl.networks.normalise import RunningNormaliser
-from giril_rl.networks.pixel_discriminators import PixelDiscriminator
+from giril_rl.networks.normalise import RunningNormaliser, running_statistics
+from giril_rl.networks.pixels import PixelDiscriminator
 from giril_rl.networks.vectors import mlp
 from giril_rl.rewards.actions import ActionEncoder
-from giril_rl.rewards.adversarial import RewardForm, adversarial_reward
-from giril_rl.rewards.chunks import per_transition
-from giril_rl.rewards.keys import PAIR_KEYS, REWARD_KEYS, check_keys
-from giril_rl.rewards.pixel_scaler import PixelScaler
-from giril_rl.rewards.scaler import ObservationScaler
-from giril_rl.rewards.transitions import check_actions, check_output, read
+from giril_rl.rewards.adversarial import (
+    RewardForm,
+    adversarial_reward,
+    discriminator_loss,
+    gradient_penalty,
+    interpolated,
+)
+from giril_rl.rewards.fitting import RewardLoss
+from giril_rl.rewards.method import GREEN, Method, register
+from giril_rl.rewards.scaler import ObservationScaler, PixelScaler
+from giril_rl.rewards.transitions import (
+    PAIR_KEYS,
+    REWARD_KEYS,
+    TransitionReward,
+    check_actions,
+    check_output,
+    observation_shape,
+    read,
+)
 from giril_rl.runs.pretrained import Pretrained, remembered
-from giril_rl.runs.randomness import seeded
+from giril_rl.runs.randomness import seeded, stream_seed
 
 DiscriminatorScaling = Literal["running", "demo_range", "standardise", "raw"]
 
 
-class DiscriminatorReward(Pretrained, TensorDictModuleBase):
+@dataclass
+class AdversarialConfig:
+    """GAIL's discriminator, its training and the reward made of it."""
+
+    form: str = knob(
+        "positive",
+        "reward of D = P(expert): positive -log(1-D), negative log D, log_ratio, reversed -log D",
+        choices=("positive", "negative", "log_ratio", "reversed"),
+    )
+    lr: float = knob(1e-3, "Adam step size (paper: 1e-3)", low=0, low_open=True)
+    updates: int = knob(10, "gradient steps with each batch of PPO", low=1)
+    batch: int = knob(250, "most pairs of expert and of policy in each gradient step", low=1)
+    penalty: float = knob(1.0, "weight of the gradient penalty; 0 leaves it out", low=0)
+    normalise: str = knob(
+        "standardise",
+        "observation rule: running statistics of the policy, or one of the demonstration",
+        choices=("running", "demo_range", "standardise", "raw", "pixels"),
+    )
+    clamp: float | None = knob(
+        10.0, "bound on normalised observations; null has none", low=0, low_open=True
+    )
+    hidden: list[int] = knob([100, 100], "hidden layers of the discriminator (tanh)", low=1)
+    seed: int | None = knob(None, "seed of the discriminator; null takes the run's seed", low=0)
+    compile: bool = knob(False, COMPILE)
+
+
+class DiscriminatorReward(Pretrained, TransitionReward):
     """A reward made of a discriminator's logit, see :func:`~giril_rl.rewards.adversarial_reward`.
 
-    Reads observation ``(*batch, d)``, or frames, and action, and writes one reward per transition,
-    ``(*batch, 1)``; the next observation takes no part (Ho and Ermon 2016, and the paper). Train it
-    with :class:`~giril_rl.rewards.DiscriminatorLoss`.
+    Reads observation ``(*batch, d)``, or frames, and action; the next observation plays no role (Ho
+    and Ermon 2016, and the paper). Writes one reward per transition, ``(*batch, 1)``. Train it with
+    :class:`~giril_rl.rewards.DiscriminatorLoss`.
 
     Args:
-        network: called with s and the action's code, gives one number, the logit of "this is the
+        network: called with s and the encoded action, returns one number, the logit of "this is the
             expert's".
-        scaler: applied to the observation. Where it says how many ``event_dims`` an observation
-            has, as this package's do, the actions' shape is held to the observations'.
-        actions: turns actions into codes.
+        scaler: applied to the observation. If it has ``event_dims``, the dimensions of one
+            observation, as this package's do, the actions' shape is checked against the
+            observations'.
+        actions: encodes actions.
         form: the reward's form.
         in_keys: keys of observation and action.
         out_keys: where the reward is written, one key.
@@ -52,7 +99,6 @@ class DiscriminatorReward(Pretrained, TensorDictModuleBase):
             a wrong shape.
 
     Examples:
-        >>> from tensordict import TensorDict
         >>> from torchrl.data import Categorical
         >>> reward = DiscriminatorReward.for_vectors(2, Categorical(3), normalise="raw")
         >>> s, a = torch.zeros(4, 2), torch.zeros(4, dtype=torch.int64)
@@ -71,11 +117,8 @@ class DiscriminatorReward(Pretrained, TensorDictModuleBase):
         in_keys: Sequence[NestedKey] = PAIR_KEYS,
         out_keys: Sequence[NestedKey] = REWARD_KEYS,
     ) -> None:
-        super().__init__()
         adversarial_reward(torch.zeros(1), form)  # Refuses an unknown form before it is needed.
-        check_keys("a discriminator's reward", ("observation", "action"), in_keys, out_keys)
-        self.in_keys: list[NestedKey] = list(in_keys)
-        self.out_keys: list[NestedKey] = list(out_keys)
+        super().__init__("a discriminator's reward", ("observation", "action"), in_keys, out_keys)
         self.network = network
         self.scaler = scaler
         self.actions = actions
@@ -96,7 +139,7 @@ class DiscriminatorReward(Pretrained, TensorDictModuleBase):
         in_keys: Sequence[NestedKey] = PAIR_KEYS,
         out_keys: Sequence[NestedKey] = REWARD_KEYS,
     ) -> DiscriminatorReward:
-        """The paper's body for vector observations, initialised from ``seed`` alone.
+        """The paper's network for vector observations, initialised from ``seed`` alone.
 
         Args:
             observation_dim: size of the observation.
@@ -105,16 +148,16 @@ class DiscriminatorReward(Pretrained, TensorDictModuleBase):
             form: the reward's form.
             normalise: the observation's rule, see :func:`discriminator_scaler`.
             clamp: bound on each scaled observation; None has none.
-            seed: seed of the weights. The global random state is neither read nor changed.
-            in_keys: keys of observation and action.
-            out_keys: where the reward is written, one key.
+            seed: seed of the weights. The global random state stays as it is.
+            in_keys: see the class.
+            out_keys: see the class.
 
         Raises:
             UserError: for an unknown form, rule or kind of action.
         """
         actions = ActionEncoder(action_spec)
         with seeded(seed):
-            network = JoinedSequential(*mlp(observation_dim + actions.size, 1, hidden))
+            network = mlp(observation_dim + actions.size, 1, hidden)
         return cls(
             network,
             scaler=discriminator_scaler(observation_dim, normalise, clamp),
@@ -136,19 +179,7 @@ class DiscriminatorReward(Pretrained, TensorDictModuleBase):
         in_keys: Sequence[NestedKey] = PAIR_KEYS,
         out_keys: Sequence[NestedKey] = REWARD_KEYS,
     ) -> DiscriminatorReward:
-        """The paper's body for stacks of 84x84 frames, initialised from ``seed`` alone.
-
-        Args:
-            action_spec: the environment's action spec.
-            channels: frames in an observation.
-            form: see :meth:`for_vectors`, as for all others.
-            seed: seed of the weights.
-            in_keys: keys of observation and action.
-            out_keys: where the reward is written, one key.
-
-        Raises:
-            UserError: for an unknown form or kind of action.
-        """
+        """The paper's network for ``channels`` frames of 84x84; see `for_vectors`."""
         actions = ActionEncoder(action_spec)
         with seeded(seed):
             network = PixelDiscriminator(actions.size, channels=channels)
@@ -167,45 +198,42 @@ class DiscriminatorReward(Pretrained, TensorDictModuleBase):
             self.scaler.fit(observations)
 
     def observe(self, observations: Tensor) -> None:
-        """Lets running statistics take in the policy's observations ``(*batch, d)``."""
+        """Updates running statistics, if any, with the policy's observations ``(*batch, d)``."""
         if isinstance(self.scaler, RunningNormaliser):
             self.scaler.update(observations)
 
     def inputs(self, observation: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
-        """The scaled observation and the action's code, for what the environment gives."""
+        """The scaled observation and the encoded action, whose shapes are checked."""
         if (event_dims := getattr(self.scaler, "event_dims", None)) is not None:
             check_actions(self.actions, action, observation, event_dims)
         return self.scaler(observation), self.actions(action)
 
-    def logit(self, observation: Tensor, action_code: Tensor) -> Tensor:
-        """The logit ``(*batch,)`` of a scaled observation and an action's code."""
-        logit = self.network(observation, action_code)
-        check_output("the discriminator", logit, (*action_code.shape[:-1], 1))
+    def logit(self, observation: Tensor, encoding: Tensor) -> Tensor:
+        """The logit ``(*batch,)`` of a scaled observation and an encoded action."""
+        logit = self.network(observation, encoding)
+        check_output("the discriminator", logit, (*encoding.shape[:-1], 1))
         return logit.squeeze(-1)
 
-    @dispatch(auto_batch_size=False)
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes each transition's reward."""
-        pair = read(tensordict, self.in_keys)
-        reward = per_transition(self._value, pair, getattr(self.scaler, "event_dims", 1))
-        return tensordict.set(self.out_keys[0], reward.unsqueeze(-1))
+    def check(self, *transitions: Tensor) -> None:
+        """Nothing here: :meth:`inputs` checks for the loss as well."""
 
-    def _value(self, observation: Tensor, action: Tensor) -> Tensor:
-        return adversarial_reward(self.logit(*self.inputs(observation, action)), self.form)
+    def value(self, *transitions: Tensor) -> Tensor:
+        """The reward of each pair."""
+        return adversarial_reward(self.logit(*self.inputs(*transitions)), self.form)
 
 
 def discriminator_scaler(
     observation_dim: int, rule: DiscriminatorScaling, clamp: float | None
 ) -> nn.Module:
-    """What brings observations to the scale of a discriminator's input.
+    """Scales a discriminator's observations.
 
-    A policy that knows nothing goes where an expert never was, tens of the demonstration's
+    An untrained policy goes where an expert never was, tens of the demonstration's standard
     deviations away.
 
     Args:
         observation_dim: size of the observation's last dimension.
-        rule: ``"running"`` for the mean and deviation of all that the policy has seen so far
-            (update it with each batch before the discriminator), or a rule of
+        rule: ``"running"`` for mean and standard deviation of all that the policy has seen so far
+            (update them with each batch before the discriminator), or a rule of
             :class:`~giril_rl.rewards.ObservationScaler`, fitted to the demonstration.
         clamp: bound on the result; None has none.
 
@@ -226,3 +254,185 @@ def discriminator_scaler(
     return ObservationScaler(
         observation_dim, rule=rule, clamp=clamp is not None, limit=1.0 if clamp is None else clamp
     )
+
+
+class DiscriminatorLoss(RewardLoss):
+    """GAIL's binary cross-entropy on logits, with an optional gradient penalty.
+
+    - ``loss_expert`` and ``loss_policy``: the two terms of
+      :func:`~giril_rl.rewards.discriminator_loss`.
+    - ``loss_penalty``, where the weight is not 0: :func:`~giril_rl.rewards.gradient_penalty` of the
+      logit at points between the two sets' scaled observations and encoded actions, discrete ones
+      included. One uniform weight per pair, from the global generator.
+
+    Their sum is to be minimised. ``accuracy_expert`` and ``accuracy_policy`` are logged besides.
+
+    The two sets are usually under ``"expert"`` and ``"policy"``, each of any leading shape. Their
+    shapes may differ; the TensorDict that holds both then has no batch dimension. Without penalty
+    and for equal sizes the loss is that of TorchRL's ``GAILLoss``, which expects probabilities.
+    There is no ``reduction``: each term is a mean over its own set.
+
+    Args:
+        reward: the module to train; its parameters are this loss's parameters.
+        penalty: weight of the gradient penalty; 0 leaves it out.
+        functional: see :class:`~giril_rl.rewards.TransitionLoss`.
+
+    Raises:
+        UserError: for a negative penalty, or a set that is missing, empty or of a wrong shape.
+
+    Examples:
+        >>> from torchrl.data import Categorical
+        >>> reward = DiscriminatorReward.for_vectors(2, Categorical(3), normalise="raw")
+        >>> pairs = lambda n: {"observation": torch.zeros(n, 2), "action": torch.zeros(n).long()}
+        >>> batch = TensorDict({"expert": pairs(50), "policy": pairs(256)})
+        >>> sorted(DiscriminatorLoss(reward, penalty=10.0)(batch).keys())
+        ['accuracy_expert', 'accuracy_policy', 'loss_expert', 'loss_penalty', 'loss_policy']
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        """The keys that :meth:`set_keys` changes; their defaults follow the reward's ``in_keys``.
+
+        Attributes:
+            expert_observation: raw observations of the expert ``(*n, d)``.
+            expert_action: its actions, as the environment takes them.
+            policy_observation: raw observations of the policy ``(*m, d)``.
+            policy_action: its actions.
+        """
+
+        expert_observation: NestedKey = ("expert", "observation")
+        expert_action: NestedKey = ("expert", "action")
+        policy_observation: NestedKey = ("policy", "observation")
+        policy_action: NestedKey = ("policy", "action")
+
+    default_keys = _AcceptedKeys
+    tensor_keys: _AcceptedKeys
+    reward: DiscriminatorReward
+
+    def __init__(
+        self, reward: DiscriminatorReward, *, penalty: float = 0.0, functional: bool = False
+    ) -> None:
+        if not penalty >= 0:
+            raise UserError(f"penalty={penalty} is negative: give a weight of 0 or more.")
+        super().__init__(reward, functional=functional)
+        self.penalty = penalty
+        observation, action = (k if isinstance(k, tuple) else (k,) for k in reward.in_keys)
+        self.set_keys(
+            expert_observation=("expert", *observation),
+            expert_action=("expert", *action),
+            policy_observation=("policy", *observation),
+            policy_action=("policy", *action),
+        )
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        """Keys of the expert's observation and action and of the policy's."""
+        keys = self.tensor_keys
+        expert = [keys.expert_observation, keys.expert_action]
+        return [*expert, keys.policy_observation, keys.policy_action]
+
+    @property
+    def out_keys(self) -> list[NestedKey]:
+        """Names of the terms to be added, ``loss_*``, and of what is logged."""
+        penalty = ["loss_penalty"] if self.penalty else []
+        return ["loss_expert", "loss_policy", *penalty, *self.log_keys]
+
+    @property
+    def log_keys(self) -> list[str]:
+        """Names of what is logged."""
+        return ["accuracy_expert", "accuracy_policy"]
+
+    def after_step(self, log: Mapping[str, Tensor]) -> None:
+        """Follows each gradient step; ``log`` has the step's :attr:`log_keys`."""
+
+    def logged_state(self) -> dict[str, float]:
+        """Numbers of the loss's own that are worth logging."""
+        return {}
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """The terms and what is logged, all scalars."""
+        with self.parameters_in_reward():
+            return self._terms(tensordict)
+
+    def _terms(self, tensordict: TensorDictBase) -> TensorDictBase:
+        entries = read(tensordict, self.in_keys)
+        expert = _flat("expert", *self.reward.inputs(*entries[:2]))
+        policy = _flat("policy", *self.reward.inputs(*entries[2:]))
+        # One pass for both sets.
+        observation, encoding = (torch.cat(sets) for sets in zip(expert, policy, strict=True))
+        logit, out = self._judge(observation, encoding, len(expert[0]))
+        logits = logit[: len(expert[0])], logit[len(expert[0]) :]
+        out["loss_expert"], out["loss_policy"] = discriminator_loss(*logits)
+        if self.penalty:
+            weight = torch.rand(max(len(expert[0]), len(policy[0])), device=logit.device)
+            points = [interpolated(e, p, weight) for e, p in zip(expert, policy, strict=True)]
+            # With the batch's own statistics each sample's gradient would depend on all samples.
+            with running_statistics(self.reward):
+                out["loss_penalty"] = self.penalty * gradient_penalty(self.reward.logit, points)
+        out["accuracy_expert"] = (logits[0] > 0).to(logit.dtype).mean()
+        out["accuracy_policy"] = (logits[1] < 0).to(logit.dtype).mean()
+        return TensorDict({str(key): out[str(key)] for key in self.out_keys})
+
+    def _judge(
+        self, observation: Tensor, encoding: Tensor, experts: int
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """The logits of both sets, of which the first ``experts`` are the expert's."""
+        return self.reward.logit(observation, encoding), {}
+
+
+def _flat(name: str, observation: Tensor, encoding: Tensor) -> tuple[Tensor, Tensor]:
+    """A set's scaled observations and encoded actions, ``(n, ...)``."""
+    dims = encoding.ndim - 1
+    if dims != 1:
+        observation = observation.reshape(-1, *observation.shape[dims:])
+        encoding = encoding.reshape(-1, encoding.shape[-1])
+    if not len(encoding):
+        raise UserError(f"the {name}'s set has no pairs: give at least one.")
+    return observation, encoding
+
+
+def discriminator_reward(
+    settings: AdversarialConfig, env: EnvBase, pairs: TensorDictBase, *, seed: int
+) -> DiscriminatorReward:
+    """GAIL's reward, untrained, its scaler fitted to ``pairs`` unless it follows the policy.
+
+    Args:
+        settings: its settings; those of its training are the learner's.
+        env: the environment, for its specs.
+        pairs: the demonstrated transitions to learn from.
+        seed: seed of the weights. The global random state stays as it is.
+    """
+    form = cast(RewardForm, settings.form)
+    frames, size = observation_shape(env)
+    seed = stream_seed("reward", seed)
+    if frames:
+        reward = DiscriminatorReward.for_pixels(
+            env.action_spec, channels=frames, form=form, seed=seed
+        )
+    else:
+        reward = DiscriminatorReward.for_vectors(
+            size,
+            env.action_spec,
+            hidden=settings.hidden,
+            form=form,
+            normalise=cast(DiscriminatorScaling, settings.normalise),
+            clamp=settings.clamp,
+            seed=seed,
+        )
+    reward.fit_scaler(pairs.get("observation"))
+    return reward
+
+
+register(
+    Method(
+        "gail",
+        "GAIL",
+        GREEN,
+        trained="beside",
+        settings=AdversarialConfig,
+        build=discriminator_reward,
+        loss=lambda reward, settings: DiscriminatorLoss(reward, penalty=settings.penalty),
+        rank=2,
+    )
+)

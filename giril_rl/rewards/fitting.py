@@ -1,16 +1,157 @@
-"""Fitting a reward to a demonstration, in one call."""
+"""Losses that train a reward on a demonstration, and fitting one in a single call."""
 
 from __future__ import annotations
 
 import math
+from abc import abstractmethod
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
+from typing import Any, Literal, cast, get_args
 
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase, TensorDictParams, dispatch
+from tensordict.utils import NestedKey
+from torch import Tensor
+from torchrl.objectives import LossModule
 
 from giril_rl.errors import UserError
-from giril_rl.rewards.transition_loss import TransitionLoss
-from giril_rl.rewards.transitions import check_finite, check_transitions, read
+from giril_rl.rewards.scaler import check_finite
+from giril_rl.rewards.transitions import check_transitions, read
 from giril_rl.runs.randomness import seeded
+
+Reduction = Literal["mean", "sum", "none"]
+
+
+class RewardLoss(LossModule):
+    """A loss that trains a reward module.
+
+    Args:
+        reward: the module to train; its parameters are this loss's parameters.
+        functional: keep parameters and buffers apart from the module, under ``reward_params``, as
+            TorchRL's own losses do. By default they stay in the module: the loss's ``state_dict``
+            then has the module's names, and its noise generator's state.
+    """
+
+    reward: TensorDictModuleBase
+    reward_params: TensorDictParams
+    target_reward_params: TensorDictParams
+
+    def __init__(self, reward: TensorDictModuleBase, *, functional: bool = False) -> None:
+        super().__init__()
+        if functional:
+            self.convert_to_functional(cast(Any, reward), "reward")
+        else:
+            self.reward = reward
+        self._functional = functional
+
+    @property
+    def functional(self) -> bool:
+        """Whether the parameters are kept apart from the module, under ``reward_params``."""
+        return self._functional
+
+    def parameters_in_reward(self) -> AbstractContextManager[Any]:
+        """Inside, the reward computes with the loss's ``reward_params``, if it has any."""
+        return self.reward_params.to_module(self.reward) if self.functional else nullcontext()
+
+
+class TransitionLoss(RewardLoss):
+    """A loss of single transitions, in one or more terms, whose sum is to be minimised.
+
+    A subclass names its terms in ``out_keys`` and computes them in :meth:`terms`, one number per
+    transition each.
+
+    Args:
+        reward: the module to train, which reads observation, action and next observation; its
+            parameters are this loss's parameters.
+        reduction: ``"mean"``, ``"sum"`` or ``"none"`` over transitions.
+        functional: keep parameters and buffers apart from the module, under ``reward_params``, as
+            TorchRL's own losses do. By default they stay in the module: the loss's ``state_dict``
+            then has the module's names, and its noise generator's state.
+
+    Raises:
+        UserError: for an unknown reduction, or missing entries.
+
+    Examples:
+        >>> from torchrl.data import Bounded
+        >>> from giril_rl.rewards import GenerativeReward
+        >>> class KLLoss(TransitionLoss):
+        ...     out_keys = ["loss_kl"]
+        ...     def terms(self, observation, action, next_observation):
+        ...         mu, logvar = self.reward.encode(observation, next_observation)
+        ...         return (0.5 * (logvar.exp() + mu.square() - 1 - logvar).sum(-1),)
+        >>> reward = GenerativeReward.for_vectors(2, Bounded(-1, 1, shape=(1,)), normalise="raw")
+        >>> s, a = torch.zeros(4, 2), torch.zeros(4, 1)
+        >>> batch = TensorDict({"observation": s, "action": a, "next": {"observation": s}}, [4])
+        >>> KLLoss(reward, reduction="none")(batch)["loss_kl"].shape
+        torch.Size([4])
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        """The keys that :meth:`set_keys` changes; their defaults are the reward's ``in_keys``.
+
+        Attributes:
+            observation: observation ``(*batch, d)``.
+            action: action, as the environment takes it.
+            next_observation: the true next observation.
+        """
+
+        observation: NestedKey = "observation"
+        action: NestedKey = "action"
+        next_observation: NestedKey = ("next", "observation")
+
+    default_keys = _AcceptedKeys
+    tensor_keys: _AcceptedKeys
+
+    def __init__(
+        self,
+        reward: TensorDictModuleBase,
+        *,
+        reduction: Reduction = "mean",
+        functional: bool = False,
+    ) -> None:
+        if reduction not in get_args(Reduction):
+            raise UserError(f"reduction={reduction!r} is unknown: choose mean, sum or none.")
+        super().__init__(reward, functional=functional)
+        self.reduction = reduction
+        observation, action, next_observation = reward.in_keys
+        self.set_keys(observation=observation, action=action, next_observation=next_observation)
+
+    @property
+    def in_keys(self) -> list[NestedKey]:
+        """Keys of observation, action and next observation."""
+        keys = self.tensor_keys
+        return [keys.observation, keys.action, keys.next_observation]
+
+    @property
+    @abstractmethod
+    def out_keys(self) -> list[NestedKey]:
+        """Names of the terms, ``loss_*``."""
+
+    @abstractmethod
+    def terms(
+        self, observation: Tensor, action: Tensor, next_observation: Tensor
+    ) -> tuple[Tensor, ...]:
+        """The terms in the order of their names, each of the batch's shape.
+
+        Args:
+            observation: ``(*batch, d)``, as the environment gives it.
+            action: as the environment takes it.
+            next_observation: ``(*batch, d)``.
+        """
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """The terms, reduced; with ``reduction="none"`` of the batch's shape."""
+        with self.parameters_in_reward():
+            terms = self.terms(*read(tensordict, self.in_keys))
+        reduced = {
+            name: self._reduce_loss(term, tensordict=tensordict)
+            for name, term in zip(self.out_keys, terms, strict=True)
+        }
+        batch_size = tensordict.batch_size if self.reduction == "none" else []
+        return TensorDict._new_unsafe(reduced, torch.Size(batch_size))
 
 
 def fit(
@@ -24,14 +165,14 @@ def fit(
 ) -> dict[str, float]:
     """Fits the reward's scaler, then minimises its loss by Adam; the defaults are the paper's.
 
-    The recipes' training does the same with checkpoints and logs; this is for other projects.
+    This is for other projects. The recipes do the same with checkpoints and logs.
 
     Args:
         loss: the reward's loss; its module is trained in place and left in eval mode.
         demonstration: transitions of any leading shape, with the loss's ``in_keys``; a copy goes to
             the loss's device.
         steps: gradient steps.
-        batch: transitions in each, drawn with replacement.
+        batch: minibatch size, drawn with replacement.
         lr: Adam's step size.
         seed: seeds minibatches and the loss's noise. The global random state is left as it was.
 
@@ -44,7 +185,6 @@ def fit(
             spec, or a loss that is no longer finite at the end.
 
     Examples:
-        >>> from tensordict import TensorDict
         >>> from torchrl.data import Bounded
         >>> from giril_rl.rewards import GenerativeReward, GenerativeRewardLoss
         >>> s, a = torch.randn(50, 2), torch.rand(50, 1)
@@ -84,8 +224,8 @@ def fit(
 
 
 def _check(loss: TransitionLoss, demonstration: TensorDictBase) -> None:
-    """Looks at the whole demonstration once, so that a minibatch need not be looked at."""
-    entries = observation, action, following = read(demonstration, loss.in_keys)
+    """Checks the whole demonstration once, so that minibatches need no checks of values."""
+    entries = observation, action, _ = read(demonstration, loss.in_keys)
     scaler, actions = loss.reward.scaler, loss.reward.actions
     batch = observation.shape[: observation.ndim - scaler.event_dims]
     if batch != demonstration.batch_size:
@@ -93,7 +233,7 @@ def _check(loss: TransitionLoss, demonstration: TensorDictBase) -> None:
             f"the demonstration's batch_size is {list(demonstration.batch_size)} where its "
             f"observations have {list(batch)}: give TensorDict(..., batch_size={list(batch)})."
         )
-    check_transitions(scaler, actions, observation, action, following)
+    check_transitions(scaler, actions, *entries)
     for key, entry in zip(loss.in_keys, entries, strict=True):
         check_finite(str(key), entry)
     actions.check_values(action)

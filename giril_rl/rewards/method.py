@@ -1,4 +1,4 @@
-"""What the suite knows of a method: one entry, made in the method's own file."""
+"""The registry: what the suite knows of a method, in one entry, made in the method's own file."""
 
 from __future__ import annotations
 
@@ -13,10 +13,12 @@ from giril_rl.errors import UserError
 
 BLUE, ORANGE, GREEN, PINK, BLACK = "#0072B2", "#E69F00", "#009E73", "#CC79A7", "#000000"
 SKY, RED, GREY = "#56B4E9", "#D55E00", "#8C8C8C"
-"""Okabe and Ito's colours, which people who see colours differently can tell apart. Their yellow
-is left out, for it is hard to see on white."""
+"""Okabe and Ito's colours, which people with colour blindness can tell apart, without the yellow,
+which is hard to see on white."""
 Kind = Literal["method", "control"]
 Trained = Literal["before", "beside", "never"]
+Moments = Callable[[], tuple[float, float]]
+"""Computes mean and variance of a reward over the demonstration."""
 
 
 @dataclass(frozen=True)
@@ -29,16 +31,19 @@ class Method:
     Attributes:
         name: what ``result.json`` has as ``method``: the recipe's name, ``control:REWARD`` of a
             control.
-        label: what tables and legends call it.
+        label: its name in tables and legends.
         colour: of its lines.
         kind: "method" learns from a demonstration; "control" is what a method must beat.
         trained: when the reward model is trained: "before" the policy, "beside" it, or "never".
+        demonstration: whether it needs one.
         settings: the dataclass of the reward's settings, None where it has none.
         build: ``build(settings, env, pairs, seed=seed)`` makes the reward module, untrained, its
             scaler fitted to ``pairs``; None where there is no reward.
         loss: ``loss(reward, settings)`` is what its training minimises; None where it is never
             trained.
-        rank: where tables have it; those of equal rank stand in the order of their names.
+        derive: of a control, ``derive(reward, moments, seed)`` makes its reward of the trained
+            one; None where that one is used as it is.
+        rank: its place in tables; those of equal rank are sorted by name.
     """
 
     name: str
@@ -46,9 +51,11 @@ class Method:
     colour: str
     kind: Kind = "method"
     trained: Trained = "before"
+    demonstration: bool = True
     settings: type | None = None
     build: Callable[..., TensorDictModuleBase] | None = None
     loss: Callable[[Any, Any], LossModule] | None = None
+    derive: Callable[[TensorDictModuleBase, Moments, int], TensorDictModuleBase] | None = None
     rank: int = 100
 
 

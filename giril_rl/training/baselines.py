@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
@@ -21,10 +23,9 @@ RANDOM = "control:random"
 HELD_ACTION = "control:held_action"
 """The method's name in ``result.json``; such a run holds no policy but the action's number."""
 
-register(Method(RANDOM, "control: random", GREY, kind="control", trained="never", rank=207))
-register(
-    Method(HELD_ACTION, "control: held action", RED, kind="control", trained="never", rank=208)
-)
+NO_REWARD: dict[str, Any] = {"kind": "control", "trained": "never", "demonstration": False}
+register(Method(RANDOM, "control: random", GREY, rank=207, **NO_REWARD))
+register(Method(HELD_ACTION, "control: held action", RED, rank=208, **NO_REWARD))
 
 
 class RandomPolicy(TensorDictModuleBase):

@@ -15,8 +15,8 @@ from giril_rl.config.schema import BCConfig
 from giril_rl.errors import UserError
 from giril_rl.networks.normalise import RunningNormaliser
 from giril_rl.policies import NORMALISED, PPOAgent
-from giril_rl.rewards.chunks import PIXELS_AT_ONCE
 from giril_rl.rewards.method import ORANGE, Method, register
+from giril_rl.rewards.transitions import PIXELS_AT_ONCE
 from giril_rl.runs.randomness import stream_seed
 from giril_rl.runs.run import Run
 from giril_rl.training.fitting import run_fit

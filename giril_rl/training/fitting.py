@@ -11,7 +11,7 @@ from torchrl.objectives import LossModule
 
 from giril_rl.config.schema import FitConfig
 from giril_rl.graphs.gradients import TracedGradients
-from giril_rl.rewards.chunks import PIXELS_AT_ONCE
+from giril_rl.rewards.transitions import PIXELS_AT_ONCE
 from giril_rl.runs.checkpoint import restoring
 from giril_rl.runs.finite_checks import Finite
 from giril_rl.runs.interrupt import Interrupt, Interrupted

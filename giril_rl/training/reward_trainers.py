@@ -8,9 +8,8 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from giril_rl.config.schema import AdversarialConfig
 from giril_rl.graphs.gradients import TracedGradients
-from giril_rl.rewards.discriminator_loss import DiscriminatorLoss
+from giril_rl.rewards.discriminator import AdversarialConfig, DiscriminatorLoss
 from giril_rl.runs.randomness import restore_rng, rng_state, seeded, stream_seed
 
 

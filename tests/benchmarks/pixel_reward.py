@@ -18,9 +18,9 @@ from torchrl.data import Categorical
 
 from giril_rl.networks.pixel_decoder import PixelDecoder
 from giril_rl.rewards import GenerativeReward
-from giril_rl.rewards.chunks import PIXELS_AT_ONCE
-from giril_rl.rewards.equations import reconstruction_error
 from giril_rl.rewards.factored import factored_error
+from giril_rl.rewards.generative import reconstruction_error
+from giril_rl.rewards.transitions import PIXELS_AT_ONCE
 
 
 def plain(decoder: PixelDecoder) -> PixelDecoder:

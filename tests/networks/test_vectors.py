@@ -22,3 +22,10 @@ def test_value_by_hand():
 
 def test_no_hidden_layer_is_a_linear_map():
     assert [type(layer) for layer in mlp(4, 2, [])] == [nn.Linear]
+
+
+def test_several_inputs_are_concatenated():
+    network = mlp(5, 2, [3])
+    assert list(network.state_dict()) == ["0.weight", "0.bias", "2.weight", "2.bias"]
+    x, y = torch.randn(7, 4), torch.randn(7, 1)
+    assert torch.equal(network(x, y), network(torch.cat((x, y), -1)))

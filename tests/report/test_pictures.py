@@ -7,13 +7,13 @@ import sys
 import pytest
 
 from giril_rl.cli.command_line import main
-from giril_rl.config.schema import DemoConfig, ExpertConfig, GenerativeConfig, PPOConfig, RunConfig
+from giril_rl.config.schema import DemoConfig, ExpertConfig, PPOConfig, RunConfig
 from giril_rl.demos import record_demonstration
 from giril_rl.envs import gym_factory, make_env
 from giril_rl.experiments.report.pictures import _is_generative
 from giril_rl.experiments.report.rows import panels_of
 from giril_rl.experiments.report.runs import read_runs
-from giril_rl.rewards import GenerativeReward
+from giril_rl.rewards import GenerativeConfig, GenerativeReward
 from giril_rl.runs.finished import read_config, read_part, read_settings
 from giril_rl.runs.identity import config_hash
 from giril_rl.training import make_agent

@@ -1,16 +1,21 @@
 """The rewards that are held to the shared checks, what they claim, and data to check them on."""
 
 import copy
+import functools
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from types import SimpleNamespace
+from typing import Any
 
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModuleBase
-from torchrl.data import Bounded, Categorical, TensorSpec
+from torchrl.data import Bounded, Categorical, TensorSpec, Unbounded
 
+from giril_rl.methods import methods
 from giril_rl.networks.normalise import RunningNormaliser
-from giril_rl.rewards import ObservationScaler
+from giril_rl.rewards import NoiseReward, ObservationScaler
+from giril_rl.rewards.method import Method
 
 DIM = 3
 FRAMES = (4, 84, 84)
@@ -60,51 +65,93 @@ class Setting:
 
 @dataclass(frozen=True)
 class Case:
-    """A reward and what it claims, see :func:`register`."""
+    """A reward and what it claims.
+
+    Attributes:
+        name: its name in test ids.
+        build: builds it; scalers inside are fitted afterwards.
+        kind: "box", "discrete" or "pixels", which has Breakout's actions.
+        depends_on: which entries of a transition its value depends on; None means all that it
+            reads.
+        deterministic: whether equal transitions get equal rewards. A noisy one has to draw from a
+            generator of its own, and equal numbers of draws from equal states have to be equal.
+        takes_keys: whether ``build`` heeds the setting's keys.
+    """
 
     name: str
     build: Callable[[Setting], TensorDictModuleBase]
-    discrete: bool
-    depends_on: tuple[str, ...]
-    deterministic: bool
-    learned: bool
-    pixels: bool = False
+    kind: str = "box"
+    depends_on: tuple[str, ...] | None = None
+    deterministic: bool = True
+    takes_keys: bool = True
+
+    @property
+    def pixels(self) -> bool:
+        """Whether it reads stacks of frames rather than vectors."""
+        return self.kind == "pixels"
+
+    @property
+    def discrete(self) -> bool:
+        """Whether actions are integers."""
+        return self.kind != "box"
 
     @property
     def spec(self) -> TensorSpec:
-        """The action spec; that of frames is Breakout's."""
-        if self.pixels:
-            return Categorical(4)
-        return Categorical(3) if self.discrete else Bounded(-1.0, 1.0, shape=(1,))
+        """The action spec."""
+        return {"box": Bounded(-1.0, 1.0, shape=(1,)), "discrete": Categorical(3)}.get(
+            self.kind, Categorical(4)
+        )
+
+    def claims(self, module: TensorDictModuleBase) -> tuple[str, ...]:
+        """The entries that the module's value depends on."""
+        if self.depends_on is not None:
+            return self.depends_on
+        return tuple(entry for entry in ENTRIES if PLAIN[entry] in module.in_keys)
 
 
-CASES: list[Case] = []
+def registered_cases() -> list[Case]:
+    """Every registered reward with its default settings, of each kind of observation and action.
 
-
-def register(
-    name: str,
-    build: Callable[[Setting], TensorDictModuleBase],
-    *,
-    depends_on: tuple[str, ...] = ENTRIES,
-    deterministic: bool = True,
-    learned: bool = True,
-    pixels: bool = False,
-) -> None:
-    """Adds a reward to the checked ones, for Box and for Discrete actions; of pixels, for Discrete.
-
-    Args:
-        name: its name in test ids.
-        build: builds it; scalers inside are fitted afterwards.
-        depends_on: which entries of a transition its value depends on.
-        deterministic: whether equal transitions get equal rewards; a noisy one has to draw from a
-            generator of its own, and equal numbers of draws from equal states have to be equal.
-        learned: whether it has weights or statistics, which decide its value.
-        pixels: whether it reads stacks of frames rather than vectors.
+    A new method or control is checked without a line here.
     """
-    for discrete in (True,) if pixels else (False, True):
-        kind = "pixels" if pixels else "discrete" if discrete else "box"
-        claims = (depends_on, deterministic, learned, pixels)
-        CASES.append(Case(f"{name}-{kind}", build, discrete, *claims))
+    found = []
+    for name, method in methods().items():
+        if method.build is None:
+            continue
+        kinds = ("box", "discrete", "pixels") if method.kind == "method" else ("box",)
+        for kind in kinds:
+            build = functools.partial(of_method, method, kind)
+            noisy = isinstance(build(Setting(Categorical(4), PLAIN, 0)), NoiseReward)
+            case = Case(f"{name}-{kind}", build, kind, None, not noisy, takes_keys=False)
+            found.append(case)
+    return found
+
+
+def settings_of(method: Method, kind: str) -> Any:
+    """A method's default settings, of small networks and for this kind of observation."""
+    if method.settings is None:
+        return None
+    settings = method.settings()
+    changes: dict[str, Any] = {"normalise": "pixels"} if kind == "pixels" else {"hidden": [16, 16]}
+    return replace(settings, **{k: v for k, v in changes.items() if hasattr(settings, k)})
+
+
+def of_method(method: Method, kind: str, setting: Setting) -> TensorDictModuleBase:
+    """A registered reward, untrained; a control's is derived of it with moments made up."""
+    env = SimpleNamespace(
+        action_spec=setting.spec,
+        observation_spec={
+            "observation": Unbounded(FRAMES, dtype=torch.uint8)
+            if kind == "pixels"
+            else Unbounded((DIM,))
+        },
+    )
+    seen = torch.zeros(2, *FRAMES, dtype=torch.uint8) if kind == "pixels" else demonstration(0)
+    pairs = TensorDict({"observation": seen}, [len(seen)])
+    reward = method.build(settings_of(method, kind), env, pairs, seed=setting.seed)
+    if method.derive is not None:
+        reward = method.derive(reward, lambda: (2.0, 0.5), setting.seed)
+    return reward
 
 
 def build(case: Case, *, seed: int = 0, keys: dict = PLAIN, fit: bool = True):

@@ -1,8 +1,8 @@
 """What every reward module has to hold, present and future: register it, and it is checked.
 
-A reward reads transitions and writes one number for each. :func:`reward_cases.register` takes how
-one is built and what it claims; the ``check_*`` functions hold it to what holds for all and to
-its own claims, the exceptions included: what it says it does not read must not matter.
+A reward reads transitions and writes one number for each. A :class:`reward_cases.Case` says how one
+is built and what it claims. The ``check_*`` functions hold it to what holds for all and to its own
+claims: an entry that it says it does not read must not matter.
 """
 
 import copy
@@ -62,20 +62,20 @@ def check_environments_are_independent(case: Case) -> None:
     changed = rewards(module, other)
     same = [0, 1, 3]
     assert_equal(changed[same], whole[same])
-    if case.depends_on:
+    if case.claims(module):
         assert (changed[2] != whole[2]).all()
 
 
 def check_depends_on_what_it_says(case: Case) -> None:
     """Each entry of one transition changes that one's reward, or none if it is not claimed."""
     module, batch = build(case), transitions(case, 8)
-    whole = rewards(module, batch)
+    whole, claimed = rewards(module, batch), case.claims(module)
     for entry in ENTRIES:
         other = batch.clone()
         value = other.get(PLAIN[entry])
         value[3] = (value[3] + 1) % 3 if entry == "action" and case.discrete else value[3] * 0.7
         changed = (rewards(module, other) != whole).squeeze(-1)
-        assert changed.tolist() == [i == 3 and entry in case.depends_on for i in range(8)], entry
+        assert changed.tolist() == [i == 3 and entry in claimed for i in range(8)], entry
 
 
 def check_no_gradient_reaches_the_policy(case: Case) -> None:
@@ -128,7 +128,7 @@ def check_state_round_trip(case: Case, folder) -> None:
     other = build(case, seed=2, fit=False)
     other.load_state_dict(load_state(folder / "reward.safetensors"))
     assert torch.equal(rewards(other, batch), expected)
-    if case.learned:
+    if module.state_dict():  # Weights or statistics decide its value.
         assert not torch.equal(rewards(build(case, seed=2), batch), expected)
 
 
@@ -172,7 +172,7 @@ def check_terminal_step(case: Case, make_env: MakeEnv) -> None:
     expected = rewards(module, true)
     relabelled = IntrinsicReward(copy.deepcopy(module))(batch)["next", "reward"]
     assert_equal(relabelled, expected)
-    if "next_observation" in case.depends_on:
+    if "next_observation" in case.claims(module):
         done = batch["next", "done"].squeeze(-1)
         wrong = true.clone()
         wrong["next", "observation"][done] = world.next_start[done]

@@ -170,6 +170,16 @@ def test_penalty_and_its_slope_against_finite_differences(shape):
     assert slope == pytest.approx((values[0] - values[1]) / (2 * h), rel=1e-4)
 
 
+@pytest.mark.parametrize("shape", [(), (6,), (2, 3), (2, 1, 3)])
+def test_penalty_of_any_leading_shape(shape):
+    """The gradient is (3 s, 4) at s, and s is 0 or 1: norms of 4 and 5."""
+    s = torch.arange(math.prod(shape)).reshape(*shape, 1) % 2.0
+    expected = torch.where(s == 0, 9.0, 16.0).mean()
+    points = s, torch.zeros(*shape, 1)
+    found = gradient_penalty(lambda s, a: (1.5 * s.square() + 4 * a).sum(-1), points)
+    torch.testing.assert_close(found, expected)
+
+
 def test_a_flat_discriminator_has_a_finite_slope():
     network = nn.Linear(3, 1)
     nn.init.zeros_(network.weight)

@@ -1,15 +1,21 @@
-"""Every reward module against the shared checks; a new one is a ``register`` line below."""
+"""Every registered reward, and variants of its settings, against the shared checks.
 
-import itertools
-from typing import get_args
+A reward that registers itself is checked without a line here; a variant is a line in ``VARIANTS``.
+"""
+
+import functools
+from dataclasses import replace
 
 import pytest
 import reward_checks as checks
 import torch
-from reward_cases import CASES, Setting, register
+from reward_cases import Case, build, of_method, registered_cases, settings_of, transitions
+from reward_data import total
+from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch._subclasses.fake_tensor import DataDependentOutputException
 
+from giril_rl.methods import methods
 from giril_rl.rewards import (
     AffineReward,
     BottleneckReward,
@@ -21,83 +27,62 @@ from giril_rl.rewards import (
     NoiseReward,
     ObservationScaler,
     PixelScaler,
-    RewardForm,
 )
+from giril_rl.rewards.method import GREY, Method, register, unregister
 
-RULES = ("demo_range", "standardise", "raw")
-
-
-def generative(**kwargs):
-    return lambda c: GenerativeReward.for_vectors(
-        c.dim, c.spec, hidden=[16, 16], seed=c.seed, **kwargs, **c.reads()
-    )
+PAIR, STATES = ("observation", "action"), ("observation", "next_observation")
 
 
-def curiosity(**kwargs):
-    return lambda c: CuriosityReward.for_vectors(
-        c.dim, c.spec, model_hidden=[16], seed=c.seed, **kwargs, **c.reads()
-    )
-
-
-def adversarial(cls, **kwargs):
-    return lambda c: cls.for_vectors(
-        c.dim, c.spec, hidden=[16, 16], seed=c.seed, **kwargs, **c.reads("observation", "action")
-    )
-
-
-def copied(c: Setting):
-    scaler = ObservationScaler(c.dim, rule="standardise")
-    return CopyReward(scaler, **c.reads("observation", "next_observation"))
+def of_vectors(cls, *entries, **kwargs):
+    return lambda c: cls.for_vectors(c.dim, c.spec, seed=c.seed, **kwargs, **c.reads(*entries))
 
 
 def of_pixels(cls, *entries, **kwargs):
     return lambda c: cls.for_pixels(c.spec, seed=c.seed, **kwargs, **c.reads(*entries))
 
 
-def copied_pixels(c: Setting):
-    return CopyReward(PixelScaler(), **c.reads("observation", "next_observation"))
+def copied(c):
+    return CopyReward(ObservationScaler(c.dim), **c.reads(*STATES))
 
 
-for rule, prior, beta in itertools.product(RULES, ("standard", "conditional"), (1.0, 0.9)):
-    # Clamped raw observations would stop at 1, in the middle of the checks' data.
-    build = generative(normalise=rule, prior=prior, beta=beta, clamp=rule != "raw")
-    register(f"giril-{rule}-{prior}-{beta}", build, deterministic=beta == 1)
-for rule in RULES:
-    register(f"icm-{rule}", curiosity(normalise=rule, clamp=rule != "raw", hidden=[16, 16]))
-register("icm-no-features", curiosity(hidden=[]))
-FORMS = get_args(RewardForm)
-for rule, form in itertools.product(("running", *RULES), FORMS):
-    build = adversarial(DiscriminatorReward, normalise=rule, form=form)
-    register(f"gail-{rule}-{form}", build, depends_on=("observation", "action"))
-for rule, form in itertools.product(("running", "standardise"), FORMS):
-    build = adversarial(BottleneckReward, normalise=rule, form=form, latent=4)
-    register(f"vail-{rule}-{form}", build, depends_on=("observation", "action"))
-register("copy", copied, depends_on=("observation", "next_observation"))
-register(
-    "constant", lambda c: ConstantReward(2.0, out_keys=c.out_keys), depends_on=(), learned=False
-)
-register(
-    "noise",
-    lambda c: NoiseReward(2.0, 0.5, seed=c.seed, out_keys=c.out_keys),
-    depends_on=(),
-    deterministic=False,
-)
-register("negated-giril", lambda c: AffineReward(generative()(c), -1.0))
-register(
-    "centred-giril",
-    lambda c: AffineReward(generative(beta=0.9)(c), shift=-0.3),
-    deterministic=False,
-)
+def copied_pixels(c):
+    return CopyReward(PixelScaler(), **c.reads(*STATES))
 
-for prior, beta in itertools.product(("standard", "conditional"), (1.0, 0.9)):
-    build = of_pixels(GenerativeReward, prior=prior, beta=beta)
-    register(f"giril-{prior}-{beta}", build, deterministic=beta == 1, pixels=True)
-register("icm", of_pixels(CuriosityReward), pixels=True)
-for name, cls in (("gail", DiscriminatorReward), ("vail", BottleneckReward)):
-    pair = ("observation", "action")
-    register(name, of_pixels(cls, *pair), depends_on=pair, pixels=True)
-states = ("observation", "next_observation")
-register("copy", copied_pixels, depends_on=states, learned=False, pixels=True)
+
+def centred(c):
+    return AffineReward(of_vectors(GenerativeReward, hidden=[16], beta=0.9)(c), shift=-0.3)
+
+
+GIRIL = functools.partial(of_vectors, GenerativeReward, hidden=[16, 16])
+GAIL = functools.partial(of_vectors, DiscriminatorReward, *PAIR, hidden=[16, 16])
+VAIL = functools.partial(of_vectors, BottleneckReward, *PAIR, hidden=[16, 16], latent=4)
+# Clamped raw observations would stop at 1, in the middle of the checks' data.
+RAW = {"normalise": "raw", "clamp": False}
+VARIANTS = [
+    Case("giril-min-max-conditional", GIRIL(normalise="demo_range", prior="conditional")),
+    Case("giril-noise", GIRIL(beta=0.9, prior="conditional"), deterministic=False),
+    Case("giril-raw", GIRIL(**RAW), "discrete"),
+    Case("icm-min-max", of_vectors(CuriosityReward, normalise="demo_range"), "discrete"),
+    Case("icm-no-features", of_vectors(CuriosityReward, hidden=[], **RAW)),
+    Case("gail-running-negative", GAIL(normalise="running", form="negative")),
+    Case("gail-min-max-log_ratio", GAIL(normalise="demo_range", form="log_ratio"), "discrete"),
+    Case("gail-raw-reversed", GAIL(normalise="raw", form="reversed")),
+    Case("vail-running-reversed", VAIL(normalise="running", form="reversed"), "discrete"),
+    Case("copy", copied),
+    Case("constant", lambda c: ConstantReward(2.0, out_keys=c.out_keys)),
+    Case(
+        "noise",
+        lambda c: NoiseReward(2.0, 0.5, seed=c.seed, out_keys=c.out_keys),
+        deterministic=False,
+    ),
+    Case("centred-giril-noise", centred, deterministic=False),
+    Case("giril-pixels-noise", of_pixels(GenerativeReward, beta=0.9), "pixels", None, False),
+    Case("gail-pixels", of_pixels(DiscriminatorReward, *PAIR, form="negative"), "pixels"),
+    Case("copy-pixels", copied_pixels, "pixels"),
+]
+CASES = [*registered_cases(), *VARIANTS]
+WITH_KEYS = [case for case in CASES if case.takes_keys]
+TRAINED = [name for name, method in methods().items() if method.loss and method.build]
 
 every_reward = pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
 
@@ -142,7 +127,7 @@ def test_another_device(case):
     checks.check_another_device(case)
 
 
-@every_reward
+@pytest.mark.parametrize("case", WITH_KEYS, ids=lambda case: case.name)
 def test_nested_keys(case):
     checks.check_nested_keys(case)
 
@@ -155,6 +140,39 @@ def test_environment_and_batch_agree(case, step_counter):
 @every_reward
 def test_terminal_step(case, step_counter):
     checks.check_terminal_step(case, step_counter)
+
+
+# Registered methods
+
+
+@pytest.mark.parametrize("name", TRAINED)
+def test_a_registered_loss_trains_its_reward(name):
+    method = replace(methods()[name], derive=None)
+    case = Case(name, functools.partial(of_method, method, "box"))
+    reward, batch = build(case), transitions(case, 8)
+    loss = method.loss(reward, settings_of(method, "box"))
+    if method.trained == "beside":
+        batch = TensorDict({"expert": batch[:3], "policy": batch[3:]})
+    out = loss(batch)
+    assert set(out.keys()) == set(loss.out_keys) and total(out).isfinite()
+    total(out).backward()
+    assert any(p.grad is not None and p.grad.any() for p in reward.parameters())
+
+
+def test_a_newly_registered_reward_is_picked_up():
+    method = register(
+        Method(
+            "control:half",
+            "half",
+            GREY,
+            kind="control",
+            build=lambda settings, env, pairs, *, seed: ConstantReward(0.5),
+        )
+    )
+    try:
+        assert "control:half-box" in [case.name for case in registered_cases()]
+    finally:
+        unregister(method.name)
 
 
 # The checks themselves: each wrong reward has to be caught by the check that is there for it.
@@ -212,7 +230,7 @@ WRONG = {
 @pytest.mark.parametrize("name", WRONG)
 def test_a_wrong_reward_is_caught(name):
     build, check = WRONG[name]
-    case = checks.Case(name, build, False, checks.ENTRIES, deterministic=True, learned=True)
+    case = Case(name, build, depends_on=checks.ENTRIES)
     errors = (AssertionError, DataDependentOutputException, RuntimeError)
     with pytest.raises(errors if check == "another_device" else AssertionError):
         getattr(checks, f"check_{check}")(case)

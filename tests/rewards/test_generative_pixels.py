@@ -5,8 +5,7 @@ import copy
 import pytest
 import torch
 import torch.nn.functional as F
-from pixel_data import ACTIONS, convolved, decoded, run_in, scaled, transitions
-from tensordict import TensorDict
+from reward_data import ACTIONS, convolved, decoded, frames, run_in, scaled, train, transition
 from torch import nn
 from torch.distributions import Independent, Normal, kl_divergence
 from torchrl.data import Bounded, Categorical
@@ -19,7 +18,7 @@ from giril_rl.rewards import (
     GenerativeReward,
     GenerativeRewardLoss,
     PixelScaler,
-    chunks,
+    transitions,
 )
 
 
@@ -48,7 +47,7 @@ def literal(reward, data):
 @pytest.mark.parametrize("clamp", [True, False])
 @pytest.mark.parametrize("batch", [(6,), (2, 3), ()])
 def test_the_factored_way_is_the_literal_one(clamp, batch):
-    reward, data = model(clamp=clamp, scale=0.3), transitions(*batch)
+    reward, data = model(clamp=clamp, scale=0.3), frames(*batch)
     calls = []
     reward.decoder.register_forward_hook(lambda *_: calls.append(1))
     expected = literal(reward, data)
@@ -71,7 +70,7 @@ def test_the_factored_way_is_the_literal_one(clamp, batch):
 @pytest.mark.parametrize("clamp", [True, False])
 @pytest.mark.parametrize("batch", [(20,), (2, 3), ()])
 def test_with_beta_below_1_the_two_parts_are_the_literal_network(clamp, batch):
-    reward, data = model(clamp=clamp, beta=0.9, scale=0.3).eval(), transitions(*batch)
+    reward, data = model(clamp=clamp, beta=0.9, scale=0.3).eval(), frames(*batch)
     calls, noise = [], reward.get_extra_state()
     reward.decoder.register_forward_hook(lambda *_: calls.append(1))
     expected = literal(reward, data)
@@ -131,7 +130,7 @@ DISCRETE, BOX = Categorical(ACTIONS), Bounded(-2.0, 2.0, shape=(3,))
     ids=["box", "box, not clamped", "scaler", "decoder", "actions"],
 )
 def test_parts_that_compute_something_else_get_their_own_error(parts, beta):
-    reward, data = of_parts(**parts, beta=beta).eval(), transitions(2, 3)
+    reward, data = of_parts(**parts, beta=beta).eval(), frames(2, 3)
     if not reward.actions.discrete:
         data["action"] = 3 * torch.randn(2, 3, 3)
     noise = reward.get_extra_state()
@@ -146,7 +145,7 @@ def test_parts_that_compute_something_else_get_their_own_error(parts, beta):
 
 
 def test_channels_come_first():
-    reward, data = model(), transitions(3)
+    reward, data = model(), frames(3)
     for key in ("observation", ("next", "observation")):
         data[key] = data[key].permute(0, 2, 3, 1)
     for way in (factored, literal):
@@ -155,17 +154,17 @@ def test_channels_come_first():
 
 
 def test_the_clamp_matters_here():
-    data = transitions(3)
+    data = frames(3)
     assert (factored(model(), data) < 0.9 * factored(model(clamp=False), data)).all()
 
 
 @pytest.mark.parametrize("beta", [1.0, 0.9])
 def test_the_literal_way_takes_some_transitions_at_a_time(beta, monkeypatch):
-    reward, data = model(beta=beta).eval(), transitions(2, 3)
+    reward, data = model(beta=beta).eval(), frames(2, 3)
     sizes = []
     reward.decoder.register_forward_hook(lambda _, inputs, out: sizes.append(len(out)))
     whole = literal(copy.deepcopy(reward), data)
-    monkeypatch.setattr(chunks, "PIXELS_AT_ONCE", 4)
+    monkeypatch.setattr(transitions, "PIXELS_AT_ONCE", 4)
     sizes.clear()
     parts = literal(reward, data)
     assert sizes == [4, 2]
@@ -193,7 +192,7 @@ def replaced(reward, data):
 
 @pytest.mark.parametrize("change", [adam, load, through_data, replaced])
 def test_the_weights_may_change_in_between(change):
-    reward, data = model(), transitions(4)
+    reward, data = model(), frames(4)
     before = factored(reward, data)
     change(reward, data)
     after = factored(reward, data)
@@ -202,7 +201,7 @@ def test_the_weights_may_change_in_between(change):
 
 
 def test_a_copy_has_weights_of_its_own():
-    reward, data = model(), transitions(4)
+    reward, data = model(), frames(4)
     before = factored(reward, data)
     twin = copy.deepcopy(reward)
     adam(twin, data)
@@ -211,7 +210,7 @@ def test_a_copy_has_weights_of_its_own():
 
 
 def test_nothing_is_computed_twice_for_the_same_weights(monkeypatch):
-    reward, data = model(), transitions(2)
+    reward, data = model(), frames(2)
     first = factored(reward, data)
     monkeypatch.setattr(type(reward.decoder), "action_table", None)
     assert torch.equal(factored(reward, data), first)
@@ -221,10 +220,10 @@ def test_nothing_is_computed_twice_for_the_same_weights(monkeypatch):
 
 
 class Decoder(nn.Module):
-    """Predicts the state plus the code's numbers, one for each channel."""
+    """Predicts the state plus the encoding's numbers, one for each channel."""
 
-    def forward(self, code, s):
-        return s + code[..., None, None]
+    def forward(self, encoding, s):
+        return s + encoding[..., None, None]
 
 
 class Encoder(nn.Module):
@@ -238,10 +237,10 @@ class Encoder(nn.Module):
 @pytest.mark.parametrize(
     ("beta", "clamp", "expected"),
     [
-        # s = (-1, 0.6), code (1, 0), s_hat = (0, 0.6), s' = (-1, 1).
+        # s = (-1, 0.6), a (1, 0), s_hat = (0, 0.6), s' = (-1, 1).
         (1.0, True, 1.0 + 0.16),
         (1.0, False, 1.0 + 0.16),
-        # The code is (0.25, 0.75): s_hat = (-0.75, 1.35), which is clamped to 1.
+        # The blend is (0.25, 0.75): s_hat = (-0.75, 1.35), which is clamped to 1.
         (0.25, True, 0.0625),
         (0.25, False, 0.0625 + 0.1225),
     ],
@@ -255,11 +254,8 @@ def test_equation_2_by_hand(beta, clamp, expected):
         beta=beta,
         scale=0.5,
     )
-    s, following = (
-        torch.tensor(x, dtype=torch.uint8).view(1, 2, 1, 1) for x in ([0, 204], [0, 255])
-    )
-    action = torch.tensor([0])
-    data = TensorDict({"observation": s, "action": action, "next": {"observation": following}}, [1])
+    s, s_next = (torch.tensor(x, dtype=torch.uint8).view(1, 2, 1, 1) for x in ([0, 204], [0, 255]))
+    data = transition(s, torch.tensor([0]), s_next)
     assert factored(reward, data).item() == pytest.approx(0.5 * expected, rel=1e-5)
 
 
@@ -269,7 +265,7 @@ def test_equation_2_by_hand(beta, clamp, expected):
 @pytest.mark.parametrize("prior", ["standard", "conditional"])
 def test_the_three_terms_by_hand(prior):
     reward = model(prior=prior, scale=0.7, seed=1)
-    data = transitions(6)
+    data = frames(6)
     loss = run_in(GenerativeRewardLoss(reward), data)
     torch.manual_seed(0)
     with torch.no_grad():
@@ -302,7 +298,7 @@ def test_the_three_terms_by_hand(prior):
 @pytest.mark.parametrize("prior", ["standard", "conditional"])
 def test_every_parameter_gets_a_gradient(prior):
     loss = GenerativeRewardLoss(model(prior=prior))
-    sum(loss(transitions(6)).values()).backward()
+    sum(loss(frames(6)).values()).backward()
     for name, parameter in loss.named_parameters():
         # Batch normalisation takes off what a convolution's bias adds.
         if "body" not in name or not name.endswith("bias"):
@@ -311,17 +307,10 @@ def test_every_parameter_gets_a_gradient(prior):
 
 def test_the_loss_falls_within_a_few_steps():
     torch.manual_seed(0)
-    loss, data = GenerativeRewardLoss(model()), transitions(8)
-    # Even frames, brighter after a higher action: random ones cannot be foreseen.
+    loss, data = GenerativeRewardLoss(model()), frames(8)
+    # Even frames, brighter after a higher action: random ones cannot be predicted.
     data["observation"] = data["observation"][..., :1, :1, :1].expand_as(data["observation"])
     brighter = data["observation"] // 2 + 30 * data["action"].view(8, 1, 1, 1).byte()
     data["next", "observation"] = brighter
-    optimiser = torch.optim.Adam(loss.parameters(), lr=1e-3)
-    totals = []
-    for _ in range(8):
-        optimiser.zero_grad()
-        total = sum(loss(data).values())
-        total.backward()
-        optimiser.step()
-        totals.append(total.item())
+    totals = train(loss, data, steps=8, lr=1e-3)
     assert totals[-1] < 0.8 * totals[0]

@@ -4,16 +4,15 @@ import pytest
 
 from giril_rl.config.leaves import leaves
 from giril_rl.config.schema import (
-    BottleneckConfig,
-    ControlRunConfig,
     EvalConfig,
     ExpertRunConfig,
     FitConfig,
-    GenerativeConfig,
     PPOConfig,
     RunConfig,
     TaskConfig,
 )
+from giril_rl.methods import ControlRunConfig
+from giril_rl.rewards import BottleneckConfig, GenerativeConfig
 from giril_rl.runs.identity import ADDED, NO_EFFECT, config_hash, variant, without_added
 
 TASK = TaskConfig("pole", "Pole-v0", None, 300_000, 990.0)

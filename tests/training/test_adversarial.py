@@ -8,10 +8,11 @@ from tensordict import TensorDict
 from torchrl.data import Bounded, Categorical
 from torchrl.envs import Compose
 
-from giril_rl.config.schema import AdversarialConfig, PPOConfig
+from giril_rl.config.schema import PPOConfig
 from giril_rl.envs import GymVectorEnv
 from giril_rl.policies.making import make_agent
 from giril_rl.rewards import (
+    AdversarialConfig,
     BottleneckLoss,
     BottleneckReward,
     DiscriminatorLoss,

@@ -68,8 +68,8 @@ def test_any_value_of_any_key_is_taken_or_refused(key, value):
 @settings(here, max_examples=40)
 @given(st.floats().filter(lambda number: not 0 < number <= 1))
 def test_no_beta_outside_its_range_is_taken(beta):
-    from giril_rl.config.schema import GenerativeConfig
     from giril_rl.config.validation import validate
+    from giril_rl.rewards import GenerativeConfig
 
     with pytest.raises(UserError, match=r"^beta="):
         validate(GenerativeConfig(beta=beta))

@@ -1,21 +1,19 @@
-"""The rewards that stand in for a learned one, made as the learned ones are."""
+"""The recipe `control`: its settings, and the reward that its registry entry describes."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass, field
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 
-from giril_rl.config.schema import ControlRunConfig
+from giril_rl.config.schema import AveragedRunConfig, FitConfig, knob
 from giril_rl.demos import Demonstration, holdout, subsample
 from giril_rl.envs import BatchedEnv
-from giril_rl.methods.reward_models import copy_reward, curiosity_reward, generative_reward
-from giril_rl.rewards import (
-    AffineReward,
-    ConstantReward,
-    GenerativeRewardLoss,
-    NoiseReward,
-)
+from giril_rl.methods.registry import controls
+from giril_rl.rewards import CuriosityConfig, GenerativeConfig
+from giril_rl.rewards.method import Method
 from giril_rl.runs.metrics import METRICS, read_metrics
 from giril_rl.runs.run import Run
 from giril_rl.training import (
@@ -26,6 +24,37 @@ from giril_rl.training import (
     held_action_scores,
 )
 from giril_rl.transforms.intrinsic import device_of
+
+
+@dataclass
+class ControlRunConfig(AveragedRunConfig):
+    """Settings of the controls' recipe; those that the chosen reward does not use are not read."""
+
+    reward: str = knob(
+        "constant",
+        "the reward that stands in for a learned one; random: no reward, a random policy's score; "
+        "held_action: no reward, the score of one action all the time, the best one",
+        choices=list(controls()),
+    )
+    held_episodes: int = knob(20, "held_action: episodes that choose the action", low=1)
+    giril: GenerativeConfig = field(default_factory=GenerativeConfig)
+    icm: CuriosityConfig = field(default_factory=CuriosityConfig)
+    fit: FitConfig = field(default_factory=FitConfig)
+
+    @property
+    def method(self) -> Method:
+        """The registry's entry of the control."""
+        return controls()[self.reward]
+
+    @property
+    def needs_demonstration(self) -> bool:
+        """Whether the control is made of a demonstration, and so of an expert."""
+        return self.method.demonstration
+
+    @property
+    def trains(self) -> bool:
+        """Whether a policy is trained on a reward, rather than a fixed policy scored."""
+        return self.method.build is not None
 
 
 def check_baseline(cfg: ControlRunConfig) -> None:
@@ -68,42 +97,44 @@ def control_reward(
     Args:
         cfg: the run's settings; ``cfg.giril`` and ``cfg.icm`` mean what they do in their recipes.
         env: the environment, for its specs.
-        demo: the demonstration; None for ``constant``.
+        demo: the demonstration; None for a control that needs none.
         run: where a fit's metrics and checkpoints go, and the moments that were matched.
 
     Raises:
         UserError: if the fitted reward is the same for all transitions and noise should match it.
     """
-    if demo is None:
-        return ConstantReward(), {}
-    pairs = subsample(demo, cfg.demo.subsample)
-    if cfg.reward == "copy":
-        return copy_reward(cfg.giril, env, pairs).to(cfg.device), {}
-    part = cfg.icm if cfg.reward == "untrained_icm" else cfg.giril
-    seed = cfg.seed if part.seed is None else part.seed
-    seeds = {"reward": seed}
-    if cfg.reward == "untrained_icm":
-        return curiosity_reward(cfg.icm, env, pairs, seed=seed).to(cfg.device), seeds
-    reward = generative_reward(cfg.giril, env, pairs, seed=seed).to(cfg.device)
-    if cfg.reward == "untrained_giril":
+    method = cfg.method
+    assert method.build is not None
+    settings = next((p for p in (cfg.giril, cfg.icm) if type(p) is method.settings), None)
+    seed = cfg.seed if settings is None or settings.seed is None else settings.seed
+    pairs = None if demo is None else subsample(demo, cfg.demo.subsample)
+    reward = method.build(settings, env, pairs, seed=seed).to(cfg.device)
+    # A reward without weights, such as the copy, depends on no seed.
+    seeds = {"reward": seed} if list(reward.parameters()) else {}
+    if method.loss is not None:
+        assert demo is not None and pairs is not None
+        fit_reward(
+            method.loss(reward, settings),
+            pairs,
+            cfg.fit,
+            seed=seed,
+            run=run,
+            validation=holdout(demo, cfg.demo.subsample),
+        )
+    if method.derive is None:
         return reward, seeds
-    fit_reward(
-        GenerativeRewardLoss(reward, alpha=cfg.giril.alpha),
-        pairs,
-        cfg.fit,
-        seed=seed,
-        run=run,
-        validation=holdout(demo, cfg.demo.subsample),
-    )
-    if cfg.reward == "negated_giril":
-        return AffineReward(reward, scale=-1.0), seeds
+    return method.derive(reward, lambda: _logged_moments(reward, pairs, run), seed), seeds
+
+
+def _logged_moments(
+    reward: TensorDictModuleBase, pairs: TensorDictBase | None, run: Run
+) -> tuple[float, float]:
+    assert pairs is not None
     mean, variance = moments(reward, pairs)
     # A resumed run has them already, before the rows that it continues.
     if not any(row.get("phase") == "moments" for row in read_metrics(run.folder / METRICS)):
         run.log(0, {"moments/mean": mean, "moments/variance": variance}, phase="moments")
-    if cfg.reward == "centred_giril":
-        return AffineReward(reward, shift=-mean), seeds
-    return NoiseReward(mean, variance, seed=seed), seeds
+    return mean, variance
 
 
 @torch.no_grad()
@@ -112,10 +143,11 @@ def moments(reward: TensorDictModuleBase, data: TensorDictBase) -> tuple[float, 
 
     Args:
         reward: a module that writes one key, one value per transition.
-        data: the transitions, which are left as they are.
+        data: the transitions, which stay as they are.
 
     Examples:
         >>> from tensordict import TensorDict
+        >>> from giril_rl.rewards import ConstantReward
         >>> data = TensorDict({"observation": torch.zeros(4, 2)}, [4])
         >>> moments(ConstantReward(3.0), data)
         (3.0, 0.0)

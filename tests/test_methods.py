@@ -2,22 +2,18 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from giril_rl.config.schema import (
-    ControlRunConfig,
-    CuriosityConfig,
-    DemoConfig,
-    FitConfig,
-    GenerativeConfig,
-    TaskConfig,
-)
+from giril_rl.config.schema import DemoConfig, FitConfig, TaskConfig
 from giril_rl.demos import Demonstration
 from giril_rl.envs import make_env
-from giril_rl.methods.control_rewards import control_reward, moments
+from giril_rl.methods import ControlRunConfig
+from giril_rl.methods.controls import control_reward, moments
 from giril_rl.rewards import (
     AffineReward,
     ConstantReward,
     CopyReward,
+    CuriosityConfig,
     CuriosityReward,
+    GenerativeConfig,
     GenerativeReward,
     NoiseReward,
 )

@@ -1,4 +1,4 @@
-"""Entries that torch would broadcast or misread: one sentence, from rewards and losses alike."""
+"""What rewards read: entries of a wrong shape are refused, and many are taken some at a time."""
 
 import pytest
 import torch
@@ -20,6 +20,8 @@ from giril_rl.rewards import (
     GenerativeRewardLoss,
     ObservationScaler,
 )
+from giril_rl.rewards import transitions as transitions_module
+from giril_rl.rewards.transitions import per_transition
 
 BOX = Bounded(-1, 1, shape=(2,))
 INTEGERS = torch.tensor([0, 2, 1])
@@ -153,3 +155,57 @@ def test_a_scaler_of_ones_own_says_nothing_of_shapes():
     )
     batch = TensorDict({"observation": torch.randn(3, 9), "action": torch.rand(3, 2)}, [3])
     assert reward(batch)["next", "intrinsic_reward"].shape == (3, 1)
+
+
+class Weighted:
+    """``sum(x) * y`` of each element, and the leading shapes that it was called with."""
+
+    def __init__(self):
+        self.shapes = []
+
+    def __call__(self, x, y):
+        self.shapes.append(tuple(y.shape))
+        return x.sum((-3, -2, -1)) * y
+
+
+def data(*batch):
+    x = torch.arange(6.0 * torch.Size(batch).numel()).reshape(*batch, 1, 2, 3)
+    return x, torch.randn(batch)
+
+
+@pytest.mark.parametrize(
+    ("batch", "shapes"),
+    [
+        ((4,), [(4,)]),
+        ((9,), [(4,), (4,), (1,)]),
+        ((2, 2), [(2, 2)]),
+        ((2, 3), [(4,), (2,)]),
+        ((2, 2, 2), [(4,), (4,)]),
+        ((), [()]),
+        ((0,), [(0,)]),
+    ],
+)
+def test_frames_are_taken_some_at_a_time(batch, shapes, monkeypatch):
+    monkeypatch.setattr(transitions_module, "PIXELS_AT_ONCE", 4)
+    function, (x, y) = Weighted(), data(*batch)
+    out = per_transition(function, (x, y), event_dims=3)
+    assert function.shapes == shapes
+    assert out.shape == batch
+    assert torch.equal(out, x.sum((-3, -2, -1)) * y)
+
+
+def test_vectors_are_taken_at_once(monkeypatch):
+    monkeypatch.setattr(transitions_module, "PIXELS_AT_ONCE", 4)
+    sizes = []
+    per_transition(lambda x: sizes.append(len(x)) or x.sum(-1), (torch.ones(9, 3),), event_dims=1)
+    assert sizes == [9]
+
+
+def test_gradients_pass_and_inputs_need_not_be_contiguous(monkeypatch):
+    monkeypatch.setattr(transitions_module, "PIXELS_AT_ONCE", 4)
+    x, y = data(3, 2)
+    x, y = x.transpose(0, 1), y.T.requires_grad_()
+    out = per_transition(Weighted(), (x, y), event_dims=3)
+    assert torch.equal(out, x.sum((-3, -2, -1)) * y)
+    out.sum().backward()
+    assert torch.equal(y.grad, x.sum((-3, -2, -1)))
