@@ -12,6 +12,9 @@ from types import ModuleType
 
 MOVED = {
     "configs": "config.schema",
+    "envs.atari_game": "envs.atari_preprocessing",
+    "envs.atari_gym": "envs.atari_family",
+    "envs.make": "envs.families",
     "networks.acting": "policies.acting",
     "networks.agents": "policies.agents",
     "networks.pixel_policy": "policies.pixel_policy",

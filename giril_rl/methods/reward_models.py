@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import cast
 
-import torch
 from tensordict import TensorDictBase
 
 from giril_rl.config.schema import (
@@ -13,7 +12,7 @@ from giril_rl.config.schema import (
     CuriosityConfig,
     GenerativeConfig,
 )
-from giril_rl.envs import BatchedEnv
+from giril_rl.envs import BatchedEnv, observation_kind
 from giril_rl.rewards import (
     BottleneckReward,
     CopyReward,
@@ -209,4 +208,4 @@ def bottleneck_reward(
 def _observation(env: BatchedEnv) -> tuple[int, int]:
     """Frames in an observation (0 for vectors), and the size of its last dimension."""
     spec = env.observation_spec["observation"]
-    return (spec.shape[-3] if spec.dtype == torch.uint8 else 0), spec.shape[-1]
+    return (spec.shape[-3] if observation_kind(env) == "image" else 0), spec.shape[-1]

@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import torch
 from torchrl.data import Categorical
 from torchrl.envs import EnvBase
 
+from giril_rl.envs import observation_kind
 from giril_rl.errors import UserError
 from giril_rl.networks.action_bounds import single_action_spec, unsupported
 from giril_rl.policies.pixel_policy import PixelActorCritic
@@ -136,6 +136,6 @@ def _needed(env: EnvBase) -> tuple[type[Any], dict[str, Any]]:
     actions = single_action_spec(env.action_spec)
     if actions.ndim - env.batch_dims != (0 if isinstance(actions, Categorical) else 1):
         raise unsupported(actions)
-    if observation.dtype == torch.uint8:
+    if observation_kind(env) == "image":
         return PixelActorCritic, {"actions": actions, "channels": observation.shape[-3]}
     return ActorCritic, {"observation_size": observation.shape[-1], "action_spec": actions}

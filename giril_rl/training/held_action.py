@@ -8,7 +8,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.data import Categorical, OneHot, TensorSpec
 
 from giril_rl.config.schema import TaskConfig
-from giril_rl.demos.task import spaces_of
+from giril_rl.envs import spaces_of
 from giril_rl.errors import UserError
 from giril_rl.networks.action_bounds import single_action_spec
 from giril_rl.runs.progress import progress

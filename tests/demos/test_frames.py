@@ -8,7 +8,7 @@ import torch
 from pixels import Pixels, steer
 
 from giril_rl.demos import Demonstration, record_demonstration, verify_by_replay
-from giril_rl.demos.frames import load_frames, save_frames
+from giril_rl.demos.storage import load_frames, save_frames
 from giril_rl.errors import UserError
 from giril_rl.files.disk import read_json, write_json
 

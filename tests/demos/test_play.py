@@ -98,7 +98,7 @@ def test_without_pygame_or_a_screen_one_sentence_says_so(tmp_path, monkeypatch, 
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setattr(sys, "platform", "linux")
     assert "there is no display here" in refused(capsys, "--task", "breakout")
-    assert "is no Atari game" in refused(capsys, "--env-id", "CartPole-v1")
+    assert "shows no images" in refused(capsys, "--env-id", "CartPole-v1")
     assert "--episodes 0: at least 1" in refused(capsys, "--task", "breakout", "--episodes", "0")
     assert "--seed -1: at least 0" in refused(capsys, "--task", "breakout", "--seed", "-1")
     assert "either --task NAME or --env-id ID" in refused(capsys)

@@ -3,7 +3,7 @@ import pytest
 
 from giril_rl.config.schema import TaskConfig
 from giril_rl.envs import gym_factory, make_env
-from giril_rl.envs.make import _import
+from giril_rl.envs.gym_api import import_package
 from giril_rl.errors import UserError
 
 
@@ -64,7 +64,7 @@ def test_the_tasks_limit_goes_before_the_registered_one():
 
 def test_missing_packages_are_named(monkeypatch):
     with pytest.raises(UserError, match=r"needs no_such_package.* pip install no_such_"):
-        _import("no_such_package")
+        import_package("no_such_package")
 
     def make(*args, **kwargs):
         raise gymnasium.error.DependencyNotInstalled("Box2D is not there, run `pip install b`.")
