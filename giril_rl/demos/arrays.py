@@ -228,12 +228,7 @@ def meant(name: str, candidates: Iterable[str]) -> str | None:
 
 
 def renamed(found: Collection[str], wanted: Iterable[str]) -> dict[str, str]:
-    """Those of ``wanted`` that ``found`` has under another name, with that name.
-
-    Examples:
-        >>> renamed(["obs", "action", "infos"], ["observation", "action", "reward"])
-        {'observation': 'obs'}
-    """
+    """Those of ``wanted`` that ``found`` has under another name, with that name."""
     wanted = list(wanted)
     missing = [name for name in wanted if name not in found]
     return {
@@ -244,19 +239,7 @@ def renamed(found: Collection[str], wanted: Iterable[str]) -> dict[str, str]:
 
 
 def check_names(found: Collection[str], needed: Sequence[str], begin: str) -> None:
-    """Refuses a data set that lacks some of ``needed``, and guesses what it calls them.
-
-    Args:
-        found: names that it has.
-        needed: names that it must have.
-        begin: how the refusal begins, up to the missing names.
-
-    Examples:
-        >>> check_names(["obs", "action"], ["observation", "action"], "mine.npz has no")
-        Traceback (most recent call last):
-        ...
-        giril_rl.errors.UserError: mine.npz has no observation: ... by 'obs'?
-    """
+    """Refuses a data set that lacks some of ``needed``, and guesses what it calls them."""
     missing = [name for name in needed if name not in found]
     if not missing:
         return

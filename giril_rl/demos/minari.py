@@ -249,9 +249,6 @@ def read_minari(name: str, episodes: int | None = None) -> tuple[dict[str, Any],
 
     Raises:
         UserError: if h5py is missing, or the dataset is missing, damaged or of another kind.
-
-    Examples:
-        >>> columns, card = read_minari("cartpole/expert-v0")  # doctest: +SKIP
     """
     check_name(name)
     try:

@@ -10,10 +10,9 @@ from typing import Any
 import gymnasium
 import numpy as np
 import torch
-from tensordict import TensorDict
 from torch import Tensor
 
-from giril_rl.demos.check import check_demonstration
+from giril_rl.demos.arrays import to_transitions
 from giril_rl.demos.demonstration import Demonstration
 from giril_rl.demos.replay import as_executed, as_recorded, verify_by_replay
 from giril_rl.envs.gym_api import (
@@ -98,7 +97,7 @@ def record_demonstration(
         )
     env = make_fn()
     check_action_space(env.action_space, env_name(env))
-    parts: list[TensorDict] = []
+    parts: list[dict[str, np.ndarray]] = []
     seeds: list[int] = []
     lives_left: list[list[int]] = []
     distinct, numbers = _Distinct(episodes or 0), count()
@@ -113,7 +112,7 @@ def record_demonstration(
                 own = episode_seed(seed, next(numbers))
                 most = _LONGEST_EPISODE if length is None else length - bar.done
                 played, counted = _play(env, policy, own, most)
-                if length is None and not played[-1]["done"]:
+                if length is None and not (played[-1]["terminated"] or played[-1]["truncated"]):
                     raise UserError(
                         f"an episode did not end within {most:,} steps: give the task a "
                         "max_episode_steps, or set demo.length."
@@ -122,11 +121,12 @@ def record_demonstration(
                     continue
                 seeds.append(own)
                 lives_left.append(counted)
-                parts.append(_stack(played, len(parts)))
+                parts.append(_columns(played, len(parts)))
                 bar.update(1 if length is None else len(played))
     finally:
         env.close()
-    demo = Demonstration(TensorDict.cat(parts))
+    columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    demo = Demonstration(to_transitions(columns))
     demo.card = {
         "task": task,
         "env_id": env.spec.id if env.spec is not None else None,
@@ -147,7 +147,7 @@ def record_demonstration(
     meanings = getattr(env.unwrapped, "get_action_meanings", None)  # As ale-py calls it.
     if meanings is not None:
         demo.card["actions"] = list(meanings())
-    check_demonstration(demo)
+    demo.check()
     verify_by_replay(demo, make_fn)
     return demo
 
@@ -171,11 +171,10 @@ def _play(
             {
                 "observation": before,
                 "action": action,
-                "next": after,
+                "next_observation": after,
                 "reward": float(reward),
                 "terminated": bool(terminated),
                 "truncated": bool(truncated),
-                "done": bool(terminated or truncated),
             }
         )
         before = after
@@ -205,36 +204,14 @@ def _choose(
     return int(output)
 
 
-def _stack(rows: list[dict[str, Any]], episode: int) -> TensorDict:
-    def column(name: str, dtype: torch.dtype | None = None) -> Tensor:
-        return torch.as_tensor(np.stack([row[name] for row in rows]), dtype=dtype)
-
-    discrete = isinstance(rows[0]["action"], int)
-    after = {"observation": column("next")}
-    after["reward"] = column("reward", torch.float32).unsqueeze(-1)
-    for name in ("done", "terminated", "truncated"):
-        after[name] = column(name, torch.bool).unsqueeze(-1)
-    return TensorDict(
-        {
-            "observation": column("observation"),
-            "action": column("action", torch.int64 if discrete else torch.float32),
-            "episode": torch.full((len(rows),), episode),
-            "step": torch.arange(len(rows)),
-            "next": TensorDict(after, [len(rows)]),
-        },
-        [len(rows)],
-    )
+def _columns(rows: list[dict[str, Any]], episode: int) -> dict[str, np.ndarray]:
+    """The columns of one episode, see :func:`~giril_rl.demos.arrays.to_transitions`."""
+    columns = {name: np.stack([row[name] for row in rows]) for name in rows[0]}
+    return {**columns, "episode": np.full(len(rows), episode), "step": np.arange(len(rows))}
 
 
 class _Distinct:
-    """Tells which episodes repeat an earlier one, and gives up after :data:`TRIES` in a row.
-
-    Examples:
-        >>> row = {"observation": np.zeros(2), "action": 1, "next": np.ones(2)}
-        >>> distinct = _Distinct(wanted=2)
-        >>> distinct.is_new([row]), distinct.is_new([row]), distinct.is_new([row, row])
-        (True, False, True)
-    """
+    """Tells which episodes repeat an earlier one, and gives up after :data:`TRIES` in a row."""
 
     def __init__(self, wanted: int) -> None:
         self._wanted = wanted
@@ -245,7 +222,7 @@ class _Distinct:
         content = hashlib.blake2b(played[0]["observation"].tobytes())
         for row in played:
             content.update(np.asarray(row["action"]).tobytes())
-            content.update(row["next"].tobytes())
+            content.update(row["next_observation"].tobytes())
         if content.digest() not in self._known:
             self._known.add(content.digest())
             self._repeats = 0

@@ -13,12 +13,7 @@ from giril_rl.errors import UserError
 
 
 def as_executed(action: np.ndarray | int, space: gymnasium.Space) -> np.ndarray | int:
-    """A recorded action in the form that ``space``'s environment steps with.
-
-    Examples:
-        >>> as_executed(np.array([0.5], dtype=np.float32), gymnasium.spaces.Box(-1, 1, (1,)))
-        array([0.5], dtype=float32)
-    """
+    """A recorded action in the form that ``space``'s environment steps with."""
     if isinstance(space, gymnasium.spaces.Box):
         return np.asarray(action, dtype=space.dtype).reshape(space.shape)
     return int(action)
@@ -28,12 +23,6 @@ def as_recorded(observation: object) -> np.ndarray:
     """A copy of an observation, since some environments reuse one array for all steps.
 
     Images, uint8 of three dimensions, keep their type and shape; all else becomes float32 [d].
-
-    Examples:
-        >>> as_recorded(np.zeros((2, 2), dtype=np.uint8)).dtype
-        dtype('float32')
-        >>> as_recorded(np.zeros((4, 84, 84), dtype=np.uint8)).shape
-        (4, 84, 84)
     """
     array = np.asarray(observation)
     if array.dtype == np.uint8 and array.ndim == 3:

@@ -37,11 +37,7 @@ _Array = tuple[np.dtype, tuple[int, ...]]
 
 
 def save_tensors(folder: Path, transitions: TensorDict) -> None:
-    """Writes ``transitions`` with ``TensorDict.memmap`` and waits for the disk.
-
-    Raises:
-        OSError: ENOSPC if there is not room for it.
-    """
+    """Writes ``transitions`` with ``TensorDict.memmap`` and waits for the disk."""
     check_room(folder, transitions)
     transitions.detach().cpu().contiguous().memmap(folder, copy_existing=True)
     for path in sorted(folder.rglob("*"), reverse=True):
@@ -78,15 +74,6 @@ def load_tensors(folder: Path, dtypes: Collection[str] = _DTYPES) -> TensorDict:
 
     Raises:
         UserError: for anything that is not a plain tensor of the size that its metadata says.
-
-    Examples:
-        >>> import tempfile
-        >>> folder = Path(tempfile.mkdtemp())
-        >>> _ = TensorDict({"note": "text is not a tensor"}).memmap(folder)
-        >>> load_tensors(folder)  # doctest: +ELLIPSIS
-        Traceback (most recent call last):
-        ...
-        giril_rl.errors.UserError: ... holds 'note', which is not a plain tensor: ...
     """
     _inspect(folder, dtypes, top=True)
     try:
@@ -151,31 +138,15 @@ def _is_shape(value: Any) -> bool:
 
 
 def save_frames(path: Path, observation: Tensor, next_observation: Tensor) -> dict[str, Any]:
-    """Writes two columns of images as distinct planes, and the indices of each image's planes.
+    """Writes two columns of images, uint8 [N, c, h, w], as distinct planes and their indices.
 
     With stacked frames, a plane appears in up to eight places: four in observations, four in next
     observations. Planes are stored in order of first appearance, each as the XOR with the one
     before, which is mostly zero as little moves between two frames. Nothing is lost.
 
-    Args:
-        path: the file, ``.npz``.
-        observation: uint8 [N, c, h, w].
-        next_observation: uint8 [N, c, h, w].
-
     Returns:
         What :func:`load_frames` must find, as JSON: ``planes``, their number, and ``shape`` of one
         image.
-
-    Examples:
-        >>> import tempfile
-        >>> path = Path(tempfile.mkdtemp()) / "frames.npz"
-        >>> images = torch.arange(3, dtype=torch.uint8).reshape(3, 1, 1, 1).expand(3, 2, 5, 4)
-        >>> declared = save_frames(path, images[:-1], images[1:])
-        >>> declared
-        {'planes': 3, 'shape': [2, 5, 4]}
-        >>> loaded = load_frames(path, declared, length=2)
-        >>> bool((loaded[0] == images[:-1]).all() and (loaded[1] == images[1:]).all())
-        True
     """
     length, *shape = observation.shape
     columns = (observation.cpu().numpy(), next_observation.cpu().numpy())
@@ -194,17 +165,9 @@ def save_frames(path: Path, observation: Tensor, next_observation: Tensor) -> di
 
 
 def load_frames(path: Path, declared: Any, length: int) -> tuple[Tensor, Tensor]:
-    """The two columns of images that :func:`save_frames` wrote, after checking all sizes.
+    """The two columns of images, uint8 [N, c, h, w], that :func:`save_frames` wrote.
 
     Nothing is unpickled, and nothing is decompressed before its size is known to be right.
-
-    Args:
-        path: the file.
-        declared: what :func:`save_frames` returned; not trusted.
-        length: N.
-
-    Returns:
-        Observations and next observations, uint8 [N, c, h, w] each.
 
     Raises:
         UserError: if the file is missing, damaged, or holds anything else.
@@ -262,11 +225,7 @@ def _fault(path: Path, wanted: dict[str, _Array]) -> str | None:
 
 
 def npy_header(archive: zipfile.ZipFile, name: str) -> tuple[tuple[int, ...], np.dtype, bool, int]:
-    """Shape, dtype, column-major order and size in bytes that an array in an ``.npz`` file claims.
-
-    Raises:
-        ValueError: for an array in a format that numpy does not write for plain numbers.
-    """
+    """Shape, dtype, column-major order and bytes that an array in an ``.npz`` file claims."""
     with archive.open(f"{name}.npy") as file:
         version = np.lib.format.read_magic(file)
         if version not in ((1, 0), (2, 0)):

@@ -33,13 +33,7 @@ def subsample(demo: Demonstration, every: int, offset: int = 0) -> TensorDict:
 
 
 def holdout(demo: Demonstration, every: int, offset: int = 0) -> TensorDict:
-    """The transitions that :func:`subsample` leaves out, none for ``every=1``; for validation.
-
-    Args:
-        demo: the demonstration.
-        every: as for :func:`subsample`.
-        offset: as for :func:`subsample`.
-    """
+    """The transitions that :func:`subsample` leaves out, none for ``every=1``; for validation."""
     return demo.transitions[~_kept(demo, every, offset)]
 
 

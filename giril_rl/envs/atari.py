@@ -274,21 +274,7 @@ class AtariEnv(BatchedEnv):
 
 
 def _check_actions(actions: np.ndarray, games: int, count: int, longest: int) -> None:
-    """Refuses a saved history that games cannot have had; for some, ale-py would wait forever.
-
-    Args:
-        actions: int16 ``(games, time)``, -1 after a game's last action and nowhere else.
-        games: number of games.
-        count: number of legal actions.
-        longest: steps after which a game is cut.
-
-    Examples:
-        >>> _check_actions(np.array([[0, 3, -1]], dtype=np.int16), 1, 4, longest=5)
-        >>> _check_actions(np.array([[0, 4, -1]], dtype=np.int16), 1, 4, longest=5)
-        Traceback (most recent call last):
-        ...
-        ValueError: its actions are not between 0 and 3, with -1 after the last
-    """
+    """Refuses a saved history that games cannot have had; for some, ale-py would wait forever."""
     if actions.dtype != np.int16 or actions.ndim != 2 or len(actions) != games:
         raise ValueError(f"its actions are not int16 of shape [{games}, time]")
     if actions.shape[1] > longest:

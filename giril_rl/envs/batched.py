@@ -138,14 +138,6 @@ def saved_array(state: dict[str, Any], name: str, like: np.ndarray) -> np.ndarra
 
     Raises:
         ValueError: if it is anything else: the checkpoint may come from anybody.
-
-    Examples:
-        >>> saved_array({"lives": torch.tensor([3])}, "lives", np.zeros(1, dtype=np.int64))
-        array([3])
-        >>> saved_array({"lives": torch.tensor([3.0])}, "lives", np.zeros(1, dtype=np.int64))
-        Traceback (most recent call last):
-        ...
-        ValueError: its 'lives' is not int64 of shape [1]
     """
     found = saved_tensor(state, name)
     if found.dtype != like.dtype or found.shape != like.shape:
@@ -170,14 +162,7 @@ def saved_seed(state: dict[str, Any]) -> int:
 
 
 def check_counts(name: str, counts: np.ndarray, least: int, most: int | None = None) -> None:
-    """Refuses counts in a saved state that no simulator can have reached.
-
-    Examples:
-        >>> check_counts("steps", np.array([0, 7]), 0, 5)
-        Traceback (most recent call last):
-        ...
-        ValueError: its 'steps' is not between 0 and 5
-    """
+    """Refuses counts in a saved state that no simulator can have reached."""
     if (counts < least).any() or (most is not None and (counts > most).any()):
         span = f"at least {least}" if most is None else f"between {least} and {most}"
         raise ValueError(f"its {name!r} is not {span}")

@@ -47,11 +47,7 @@ def registered_spec(env_id: str) -> gymnasium.envs.registration.EnvSpec:
 
 
 def import_package(package: str, extra: str | None = None) -> None:
-    """Imports a package that registers environments.
-
-    Raises:
-        UserError: if it is not installed, with the command that installs it.
-    """
+    """Imports a package that registers environments."""
     try:
         importlib.import_module(package)
     except ImportError:
@@ -60,21 +56,12 @@ def import_package(package: str, extra: str | None = None) -> None:
 
 
 def env_name(env: gymnasium.Env) -> str:
-    """An environment's name in messages: its id, or its class.
-
-    Examples:
-        >>> env_name(gymnasium.make("CartPole-v1"))
-        'CartPole-v1'
-    """
+    """An environment's name in messages: its id, or its class."""
     return env.spec.id if env.spec is not None else type(env.unwrapped).__name__
 
 
 def check_reset(env: gymnasium.Env, returned: Any) -> tuple[Any, dict[str, Any]]:
-    """Passes on what ``reset`` returned, if it is an observation of the space's shape and a dict.
-
-    Raises:
-        UserError: if it is anything else.
-    """
+    """Passes on what ``reset`` returned: an observation of the space's shape, and a dict."""
     if not isinstance(returned, tuple) or len(returned) != 2:
         raise UserError(
             f"{env_name(env)}.reset returns no pair of observation and info: bring it to "
@@ -133,11 +120,6 @@ def without_bookkeeping(env: gymnasium.Env) -> tuple[gymnasium.Env, int | None]:
 
     Returns:
         The environment below those wrappers, and the shortest time limit stripped, in steps.
-
-    Examples:
-        >>> env, limit = without_bookkeeping(gymnasium.make("CartPole-v1"))
-        >>> type(env).__name__, limit
-        ('CartPoleEnv', 500)
     """
     limits = []
     # Exact types only: a subclass may do more.
@@ -148,13 +130,7 @@ def without_bookkeeping(env: gymnasium.Env) -> tuple[gymnasium.Env, int | None]:
 
 
 def shortest_limit(env: gymnasium.Env) -> int | None:
-    """The shortest time limit among an environment's wrappers, in steps, if there is one.
-
-    Examples:
-        >>> env = TimeLimit(gymnasium.make("CartPole-v1"), 50)
-        >>> shortest_limit(gymnasium.wrappers.RecordEpisodeStatistics(env))
-        50
-    """
+    """The shortest time limit among an environment's wrappers, in steps, if there is one."""
     limits = []
     while isinstance(env, gymnasium.Wrapper):
         limits += _own_limit(env)
@@ -167,24 +143,7 @@ def _own_limit(env: gymnasium.Env) -> list[int]:
 
 
 def action_spec(space: gymnasium.Space, num_envs: int, name: str) -> TensorSpec:
-    """TorchRL's spec of the actions of ``num_envs`` environments.
-
-    Args:
-        space: one environment's action space. Where a dimension has no bound, the spec's is
-            infinite; a Box without any becomes Unbounded.
-        num_envs: number of environments.
-        name: the environment's name, for the message.
-
-    Raises:
-        UserError: as :func:`check_action_space`.
-
-    Examples:
-        >>> action_spec(gymnasium.spaces.Discrete(3), 2, "x").shape
-        torch.Size([2])
-        >>> box = gymnasium.spaces.Box(np.float32([-1, -np.inf]), np.float32([1, np.inf]))
-        >>> action_spec(box, 1, "x").space.high
-        tensor([[1., inf]])
-    """
+    """TorchRL's spec of the actions of ``num_envs`` environments; a missing bound is infinite."""
     check_action_space(space, name)
     if isinstance(space, gymnasium.spaces.Discrete):
         return Categorical(int(space.n), shape=(num_envs,), dtype=torch.int64)
@@ -204,12 +163,6 @@ def check_action_space(space: gymnasium.Space, name: str) -> None:
 
     Raises:
         UserError: for anything but Discrete counted from 0 and a one-dimensional Box of reals.
-
-    Examples:
-        >>> check_action_space(gymnasium.spaces.Discrete(3, start=1), "x")  # doctest: +ELLIPSIS
-        Traceback (most recent call last):
-        ...
-        giril_rl.errors.UserError: x has actions of the kind Discrete(3, start=1), and actions ...
     """
     kind = f"{name} has actions of the kind {space}"
     if isinstance(space, gymnasium.spaces.Discrete):
@@ -232,10 +185,6 @@ def fill_unbounded(action: torch.Tensor, spec: TensorSpec) -> None:
 
     As :meth:`gymnasium.spaces.Box.sample` does: exponentially from a single bound, normally where
     there is none. TorchRL draws NaN and infinities there.
-
-    Args:
-        action: ``(*batch, size)``, drawn from ``spec``.
-        spec: a Bounded spec.
     """
     low, high = spec.space.low, spec.space.high
     outward = torch.empty_like(action).exponential_()

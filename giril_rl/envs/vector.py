@@ -303,20 +303,7 @@ def _check_actions(
     bounds: tuple[np.ndarray, np.ndarray] | None,
     count: int | None,
 ) -> None:
-    """Refuses a saved history of actions that simulators cannot have had.
-
-    Args:
-        actions: ``(time, *shape)``.
-        shape: of one step of all simulators.
-        bounds: lowest and highest of bounded real actions.
-        count: number of actions, where they are integers.
-
-    Examples:
-        >>> _check_actions(np.array([[0, 2]]), (2,), None, 2)
-        Traceback (most recent call last):
-        ...
-        ValueError: its actions are not ones of this task
-    """
+    """Refuses a saved history of actions that simulators cannot have had."""
     real = count is None
     if actions.shape[1:] != tuple(shape) or actions.dtype.kind != ("f" if real else "i"):
         raise ValueError("its actions are of another shape or type than this task's")
