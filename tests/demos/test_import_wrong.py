@@ -2,17 +2,13 @@
 
 import json
 import pickle
-import sys
 from pathlib import Path
 
+import datasets
 import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
-
-sys.path.insert(0, str(Path(__file__).parent))
-
-import datasets
 from wrong import (
     STRAY,
     Evil,
