@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -12,6 +13,7 @@ from torch import Tensor
 
 from giril_rl.config.nearest import nearest
 from giril_rl.errors import UserError
+from giril_rl.files.untrusted import parse_json
 
 NEEDED = ("observation", "action", "next_observation", "terminated", "truncated")
 """Columns with one row per transition; ``reward`` is optional."""
@@ -144,6 +146,15 @@ def from_episodes(episodes: Iterable[Mapping[str, np.ndarray]]) -> dict[str, np.
         return {name: np.concatenate(rows) for name, rows in parts.items()}
     except (ValueError, TypeError) as error:
         raise UserError(f"the data set's episodes do not fit each other ({error}).") from None
+
+
+def parse_card(text: object) -> dict[str, Any]:
+    """The card of an export of ours; empty for anything else that may stand there."""
+    try:
+        card = parse_json(text)  # type: ignore[arg-type]
+    except (ValueError, TypeError):
+        card = None
+    return card if isinstance(card, dict) else {}
 
 
 def _described(array: np.ndarray) -> str:

@@ -22,7 +22,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from giril_rl.demos.arrays import from_episodes
+from giril_rl.demos.arrays import from_episodes, parse_card
 from giril_rl.demos.demonstration import Demonstration
 from giril_rl.demos.storage import MOST_PACKED, check_room
 from giril_rl.errors import UserError
@@ -259,16 +259,21 @@ def read_minari(name: str, episodes: int | None = None) -> tuple[dict[str, Any],
         ) from None
     folder = minari_root() / name / "data"
     path = folder / "main_data.hdf5"
-    metadata = _metadata(folder / "metadata.json", name)
-    if metadata.get("data_format", "hdf5") != "hdf5" or not path.is_file():
+    if not (folder / "metadata.json").is_file():
         raise UserError(
-            f"the Minari dataset {name} has no main_data.hdf5: only its HDF5 format can be read."
+            f"there is no local Minari dataset {name}: `minari list local` shows them, "
+            "`minari download` fetches one."
         )
     try:
+        metadata = _metadata(folder / "metadata.json")
+        if metadata.get("data_format", "hdf5") != "hdf5" or not path.is_file():
+            raise _Fault("has no main_data.hdf5: only its HDF5 format can be read")
         with h5py.File(path, "r") as file:
-            return _read(h5py, file, name, metadata, episodes)
+            return _read(file, metadata, episodes)
     except UserError:
         raise
+    except _Fault as fault:
+        raise UserError(f"the Minari dataset {name} {fault}.") from None
     except Exception as error:  # HDF5 raises all kinds for a damaged file.
         reason = " ".join(str(error).split())
         raise UserError(
@@ -276,45 +281,38 @@ def read_minari(name: str, episodes: int | None = None) -> tuple[dict[str, Any],
         ) from None
 
 
-def _metadata(path: Path, name: str) -> dict[str, Any]:
-    if not path.is_file():
-        raise UserError(
-            f"there is no local Minari dataset {name}: `minari list local` shows them, "
-            "`minari download` fetches one."
-        )
+class _Fault(Exception):
+    """What is wrong with a dataset, as the end of a sentence that names it."""
+
+
+def _metadata(path: Path) -> dict[str, Any]:
     try:
         metadata = parse_json(read_text(path))
     except (OSError, ValueError):
         metadata = None
     if not isinstance(metadata, dict):
-        raise UserError(f"the Minari dataset {name} has damaged metadata: fetch it anew.")
+        raise _Fault("has damaged metadata: fetch it anew")
     return metadata
 
 
 def _read(
-    h5py: Any, file: Any, name: str, metadata: dict[str, Any], episodes: int | None
+    file: Any, metadata: dict[str, Any], episodes: int | None
 ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     held, said = len(file), metadata.get("total_episodes")
     if said != held:
-        raise UserError(
-            f"the Minari dataset {name} says that it has {said} episodes and has {held}: it was "
-            "cut short, fetch it anew."
+        raise _Fault(
+            f"says that it has {said} episodes and has {held}: it was cut short, fetch it anew"
         )
     if not held:
-        raise UserError(f"the Minari dataset {name} is empty: at least 2 transitions are needed.")
+        raise _Fault("is empty: at least 2 transitions are needed")
     found, seeds = [], []
     for number in range(held if episodes is None else min(held, episodes)):
-        group = _inside(h5py, file, f"episode_{number}", name)
-        found.append({ours: _array(h5py, group, theirs, name) for ours, theirs in _ARRAYS.items()})
+        group = _entry(file, f"episode_{number}")
+        found.append({ours: _array(group, theirs) for ours, theirs in _ARRAYS.items()})
         seeds.append(group.attrs.get("seed"))
-    try:
-        card = parse_json(metadata.get("description") or "{}")
-    except (ValueError, TypeError):
-        card = {}  # Most descriptions are prose.
-    card = card if isinstance(card, dict) else {}
+    card = parse_card(metadata.get("description"))  # Most descriptions are prose.
     if card.get("last_cut") is True and len(found) == held:
-        last = found[-1]["truncated"]
-        last[-1:] = False
+        found[-1]["truncated"][-1:] = False
     if all(isinstance(seed, np.integer) for seed in seeds):
         card["seeds"] = [int(seed) for seed in seeds]
     columns = from_episodes(found)
@@ -323,33 +321,37 @@ def _read(
     return columns, card
 
 
-def _inside(h5py: Any, group: Any, key: str, name: str) -> Any:
-    """An entry of ``group``, refused if it is a link."""
+def _entry(group: Any, key: str) -> Any:
+    """An entry of an HDF5 group, refused if it is a link."""
+    import h5py
+
     if not isinstance(group, h5py.Group):
-        raise UserError(f"the Minari dataset {name} has no episodes as Minari writes them.")
+        raise _Fault("has no episodes as Minari writes them")
     link = group.get(key, getlink=True)
     if link is None:
-        raise UserError(f"the Minari dataset {name} has no {key}: it is damaged, fetch it anew.")
+        raise _Fault(f"has no {key}: it is damaged, fetch it anew")
     if not isinstance(link, h5py.HardLink):
-        raise UserError(f"the Minari dataset {name} has a link for {key}: only data is read.")
+        raise _Fault(f"has a link for {key}: only data is read")
     return group[key]
 
 
-def _array(h5py: Any, group: Any, key: str, name: str) -> np.ndarray:
-    data = _inside(h5py, group, key, name)
+def _array(group: Any, key: str) -> np.ndarray:
+    import h5py
+
+    data = _entry(group, key)
     if not isinstance(data, h5py.Dataset):
-        raise UserError(
-            f"the Minari dataset {name} has {key} of several parts (a Dict or Tuple space): only "
-            "vectors, images and discrete actions are demonstrations here."
+        raise _Fault(
+            f"has {key} of several parts (a Dict or Tuple space): only vectors, images and "
+            "discrete actions are demonstrations here"
         )
     if data.external or data.is_virtual:
-        raise UserError(f"the Minari dataset {name} has {key} in another file: only data is read.")
+        raise _Fault(f"has {key} in another file: only data is read")
     if data.dtype.kind not in "fiub":
-        raise UserError(
-            f"the Minari dataset {name} has {key} of {data.dtype}, not plain numbers: images that "
-            "are JPEG-encoded are not those that were seen."
+        raise _Fault(
+            f"has {key} of {data.dtype}, not plain numbers: images that are JPEG-encoded are not "
+            "those that were seen"
         )
     if data.nbytes > MOST_PACKED * max(data.id.get_storage_size(), 1):
-        raise UserError(f"the Minari dataset {name} has {key} larger than its file: fetch it anew.")
-    check_memory(f"the Minari dataset {name}", data.nbytes)
+        raise _Fault(f"has {key} larger than its file: fetch it anew")
+    check_memory(f"the Minari file {data.file.filename}", data.nbytes)
     return np.asarray(data[()])

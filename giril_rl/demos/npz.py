@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 
 from giril_rl.config.nearest import did_you_mean
-from giril_rl.demos.arrays import NEEDED, check_names, from_episodes, renamed
+from giril_rl.demos.arrays import NEEDED, check_names, from_episodes, parse_card, renamed
 from giril_rl.demos.demonstration import Demonstration
 from giril_rl.demos.storage import BROKEN, MOST_PACKED, npy_header
 from giril_rl.errors import UserError
 from giril_rl.files.disk import sync, temporary_sibling
-from giril_rl.files.untrusted import check_memory, parse_json
+from giril_rl.files.untrusted import check_memory
 
 EPISODES = ("observations", "actions", "lengths", "terminated")
 _KNOWN = {*NEEDED, "reward", *EPISODES, "rewards", "card"}
@@ -56,8 +56,8 @@ def read_npz(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         raise UserError(
             f"{path.name} is no .npz file, or was cut short ({error}): write it anew."
         ) from None
-    card = _card(arrays.pop("card", None))
-    return (_whole(arrays) if "lengths" in arrays else arrays), card
+    card = arrays.pop("card", np.empty(0))
+    return (_whole(arrays) if "lengths" in arrays else arrays), parse_card(card.tobytes())
 
 
 def to_npz(demo: Demonstration, path: Path | str) -> None:
@@ -147,15 +147,6 @@ def _array(archive: zipfile.ZipFile, name: str) -> np.ndarray:
         raise ValueError(f"{name} has not the size that it says")
     with archive.open(member) as file:
         return np.lib.format.read_array(file, allow_pickle=False)
-
-
-def _card(array: np.ndarray | None) -> dict[str, Any]:
-    """The card of an export of ours; empty for anything else of that name."""
-    try:
-        card = parse_json(array.tobytes()) if array is not None else {}
-    except ValueError:
-        card = {}
-    return card if isinstance(card, dict) else {}
 
 
 def _whole(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
