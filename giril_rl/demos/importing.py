@@ -23,8 +23,6 @@ from giril_rl.files.disk import installed_versions
 MINARI = "minari:"
 _DTYPES = ("float32", "float64", "uint8", "int8", "int16", "int32", "int64", "bool")
 _NEEDED = ("observation", "action", "next.observation", "next.terminated", "next.truncated")
-_NEXT = {"observation": "next_observation", "reward": "reward"}
-_Read = tuple[dict[str, np.ndarray], dict[str, Any]]
 
 
 def import_demonstration(
@@ -117,20 +115,17 @@ def _read_memmap(folder: Path) -> dict[str, np.ndarray]:
             f"{folder} has the batch shape {list(data.shape)}: flatten it to [N] transitions, "
             "episode after episode."
         )
-    found = [
+    names = [
         key if isinstance(key, str) else ".".join(key) for key in data.keys(True, leaves_only=True)
     ]
-    check_names(found, _NEEDED, f"{folder} has no")
-    keys: dict[str, Any] = {name: name for name in ("observation", "action", "episode", "step")}
-    keys |= {_NEXT.get(name, name): ("next", name) for name in (*_NEXT, "terminated", "truncated")}
-    columns = {
-        name: value.numpy()
-        for name, key in keys.items()
-        if (value := data.get(key, None)) is not None
-    }
-    done = data.get(("next", "done"), None)
-    ends = [columns[name] for name in ("terminated", "truncated") if name in columns]
-    if done is not None and len(ends) == 2 and not np.array_equal(done.numpy(), ends[0] | ends[1]):
+    check_names(names, _NEEDED, f"{folder} has no")
+    after = data["next"]
+    found = {name: data.get(name, None) for name in ("observation", "action", "episode", "step")}
+    found |= {name: after.get(name, None) for name in ("reward", "terminated", "truncated")}
+    found["next_observation"] = after["observation"]
+    columns = {name: value.numpy() for name, value in found.items() if value is not None}
+    done = np.logical_or(columns["terminated"], columns["truncated"])
+    if "done" in after and not np.array_equal(after["done"].numpy(), done):
         raise UserError(f"{folder} has next.done that is not terminated or truncated: mend it.")
     return columns
 

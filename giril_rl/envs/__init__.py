@@ -1,5 +1,6 @@
 """From a task's name to a batched TorchRL environment."""
 
+from giril_rl.config.families import TaskFamily
 from giril_rl.envs.atari import AtariEnv
 from giril_rl.envs.atari_family import AtariGymEnv
 from giril_rl.envs.batched import BatchedEnv
@@ -23,6 +24,7 @@ __all__ = [
     "FixedHorizonEnv",
     "GymImageEnv",
     "GymVectorEnv",
+    "TaskFamily",
     "as_recorded_task",
     "for_scores",
     "gym_factory",

@@ -142,6 +142,26 @@ def _own_limit(env: gymnasium.Env) -> list[int]:
     return [env._max_episode_steps] if isinstance(env, TimeLimit) else []
 
 
+def check_copies(envs: list[gymnasium.Env]) -> None:
+    """Refuses environments that share a simulator, or are not of one kind."""
+    name = env_name(envs[0])
+    if len({id(env.unwrapped) for env in envs}) < len(envs):
+        raise UserError(
+            f"make_fn returned the same {name} several times, which cannot play {len(envs)} "
+            "episodes at once: make a new environment at each call."
+        )
+    kinds = {
+        "observation_space": lambda env: (env.observation_space.shape, env.observation_space.dtype),
+        "action_space": lambda env: env.action_space,
+        "time limit": shortest_limit,
+    }
+    for what, kind in kinds.items():
+        if any(kind(env) != kind(envs[0]) for env in envs):
+            raise UserError(
+                f"make_fn returned environments that differ in their {what}: make equal ones."
+            )
+
+
 def action_spec(space: gymnasium.Space, num_envs: int, name: str) -> TensorSpec:
     """TorchRL's spec of the actions of ``num_envs`` environments; a missing bound is infinite."""
     check_action_space(space, name)

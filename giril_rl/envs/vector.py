@@ -21,11 +21,11 @@ from giril_rl.envs.batched import (
 )
 from giril_rl.envs.gym_api import (
     action_spec,
+    check_copies,
     check_reset,
     check_step,
     env_name,
     fill_unbounded,
-    shortest_limit,
     silent_stdout,
     without_bookkeeping,
 )
@@ -85,7 +85,7 @@ class GymVectorEnv(BatchedEnv):
             raise UserError(f"max_episode_steps={max_episode_steps}: at least 1 is needed.")
         with silent_stdout():
             made = [make_fn() for _ in range(num_envs)]
-        _check_copies(made)
+        check_copies(made)
         self._gym_envs, limits = zip(*map(without_bookkeeping, made), strict=True)
         limits = [limit for limit in (max_episode_steps, limits[0]) if limit is not None]
         self._limit: int | None = min(limits, default=None)
@@ -275,26 +275,6 @@ class GymImageEnv(GymVectorEnv):
                 "uint8 (channels, height, width)."
             )
         return Bounded(0, 255, shape=(self.batch_size[0], *shape), dtype=torch.uint8)
-
-
-def _check_copies(envs: list[gymnasium.Env]) -> None:
-    """Refuses environments that share a simulator, or are not of one kind."""
-    name = env_name(envs[0])
-    if len({id(env.unwrapped) for env in envs}) < len(envs):
-        raise UserError(
-            f"make_fn returned the same {name} several times, which cannot play {len(envs)} "
-            "episodes at once: make a new environment at each call."
-        )
-    kinds = {
-        "observation_space": lambda env: (env.observation_space.shape, env.observation_space.dtype),
-        "action_space": lambda env: env.action_space,
-        "time limit": shortest_limit,
-    }
-    for what, kind in kinds.items():
-        if any(kind(env) != kind(envs[0]) for env in envs):
-            raise UserError(
-                f"make_fn returned environments that differ in their {what}: make equal ones."
-            )
 
 
 def _check_actions(

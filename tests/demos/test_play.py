@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from counter import Counter
 from pixels import Pixels
 
 from giril_rl.cli.command_line import main
@@ -75,6 +76,13 @@ def test_a_closed_window_keeps_nothing():
     with pytest.raises(UserError, match="closed before all episodes were over: none is kept"):
         play_demonstration(Pixels, screen, episodes=2, seed=3)
     assert screen.closed == 1
+
+
+def test_a_game_that_does_not_name_its_actions_is_refused():
+    screen = Keys()
+    with pytest.raises(UserError, match=r"Counter does not name its actions .* by hand"):
+        play_demonstration(Counter, screen, episodes=1, seed=0)
+    assert screen.frames == []
 
 
 def refused(capsys, *words):

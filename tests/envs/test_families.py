@@ -88,8 +88,7 @@ BOXES = '''
 import gymnasium
 import numpy as np
 
-from giril_rl.config.families import TaskFamily
-from giril_rl.envs import register_family
+from giril_rl.envs import TaskFamily, register_family
 
 
 class Push(gymnasium.Env):
