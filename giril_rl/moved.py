@@ -13,6 +13,9 @@ from typing import Any
 
 MOVED = {
     "configs": "config.schema",
+    "envs.atari_game": "envs.atari_preprocessing",
+    "envs.atari_gym": "envs.atari_family",
+    "envs.make": "envs.families",
     "methods.control_rewards": "methods.controls",
     "networks.acting": "policies.agent",
     "networks.agents": "policies.making",

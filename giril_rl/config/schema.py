@@ -14,6 +14,7 @@ from typing import Any
 from omegaconf import MISSING
 
 from giril_rl import moved
+from giril_rl.config.families import TaskFamily, family_of
 
 MOST = 2**63 - 1
 """The largest whole number of any knob: what torch takes for a seed or a size, and files keep."""
@@ -74,16 +75,6 @@ def split_id(env_id: str) -> tuple[str | None, str]:
     return (module if colon else None), name
 
 
-def is_atari(env_id: str) -> bool:
-    """Whether a Gymnasium id is one of the Arcade Learning Environment.
-
-    Examples:
-        >>> is_atari("ALE/Pong-v5"), is_atari("Pendulum-v1")
-        (True, False)
-    """
-    return split_id(env_id)[1].startswith("ALE/")
-
-
 @dataclass
 class TaskConfig:
     """The environment and what is known about it."""
@@ -122,9 +113,9 @@ class TaskConfig:
     )
 
     @property
-    def is_atari(self) -> bool:
-        """Whether the environment is one of the Arcade Learning Environment."""
-        return is_atari(self.env_id)
+    def family(self) -> TaskFamily:
+        """What is known of the environment by its id alone."""
+        return family_of(self.env_id)
 
 
 @dataclass

@@ -7,12 +7,11 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-import torch
 from torchrl.data import Categorical
 from torchrl.envs import EnvBase
 
 from giril_rl.config.schema import PPOConfig, TaskConfig
-from giril_rl.envs import BatchedEnv, make_env
+from giril_rl.envs import BatchedEnv, make_env, observation_kind
 from giril_rl.errors import UserError
 from giril_rl.networks.action_bounds import single_action_spec, unsupported
 from giril_rl.policies.actor_critic import ActorCritic, PPOAgent
@@ -166,6 +165,6 @@ def _needed(env: EnvBase) -> tuple[type[Any], dict[str, Any]]:
     actions = single_action_spec(env.action_spec)
     if actions.ndim - env.batch_dims != (0 if isinstance(actions, Categorical) else 1):
         raise unsupported(actions)
-    if observation.dtype == torch.uint8:
+    if observation_kind(env) == "image":
         return PixelActorCritic, {"actions": actions, "channels": observation.shape[-3]}
     return ActorCritic, {"observation_size": observation.shape[-1], "action_spec": actions}

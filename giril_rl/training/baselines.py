@@ -10,7 +10,7 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.data import Categorical, OneHot, TensorSpec
 
 from giril_rl.config.schema import TaskConfig
-from giril_rl.demos.task import spaces_of
+from giril_rl.envs import spaces_of
 from giril_rl.errors import UserError
 from giril_rl.networks.action_bounds import affine_map, single_action_spec
 from giril_rl.rewards.method import GREY, RED, Method, register

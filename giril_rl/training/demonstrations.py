@@ -16,9 +16,10 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from giril_rl.config.schema import DemoConfig, DemoRunConfig, ExpertConfig, RunConfig, TaskConfig
 from giril_rl.demos import Demonstration, check_demonstration, record_demonstration
+from giril_rl.demos.check import check_environment
 from giril_rl.demos.shipped import demonstration_folder, is_shipped
-from giril_rl.demos.task import as_recorded_task, check_environment, spaces_of
 from giril_rl.envs import gym_factory
+from giril_rl.envs.families import as_recorded_task, spaces_of
 from giril_rl.errors import UserError
 from giril_rl.files.disk import remove_leftovers
 from giril_rl.policies.agent import Agent
@@ -118,7 +119,7 @@ def obtain_demonstration(
                 deterministic=demo.deterministic,
                 task=task.name,
                 expert={key: result[key] for key in ("return_mean", "seed", "env_steps")},
-                lives=demo.lives if task.is_atari else None,
+                lives=demo.lives if task.family.has_lives else None,
             )
             recorded.save(folder)
     return Demonstration.load(folder), result
@@ -152,7 +153,7 @@ def demonstration_place(cfg: RunConfig, demo: DemoConfig, expert: str) -> Path:
 
 def _identity(task: TaskConfig, demo: DemoConfig, expert: str) -> str:
     """Twelve hex digits of what decides a demonstration."""
-    unread = {"path", "subsample"} | (set() if task.is_atari else {"lives"})
+    unread = {"path", "subsample"} | (set() if task.family.has_lives else {"lives"})
     chosen = {key: value for key, value in asdict(demo).items() if key not in unread}
     parts = without_added({"demo": chosen, "task": asdict(task)}, drop=NO_EFFECT)
     identity = json.dumps([parts["demo"], parts["task"], expert], sort_keys=True)

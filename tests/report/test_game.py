@@ -6,7 +6,7 @@ import torch
 from tensordict.nn import TensorDictModule
 
 from giril_rl.config.schema import TaskConfig
-from giril_rl.envs.atari_game import AtariGame
+from giril_rl.envs.atari_preprocessing import AtariGame
 from giril_rl.experiments.report.game import play_game, typical_game
 
 pytest.importorskip("ale_py")

@@ -7,7 +7,7 @@ from tensordict.nn import TensorDictModule
 
 from giril_rl.config.schema import DemoConfig, ExpertConfig, RunConfig, TaskConfig
 from giril_rl.demos import Demonstration
-from giril_rl.demos.task import as_recorded_task
+from giril_rl.envs import as_recorded_task
 from giril_rl.errors import UserError
 from giril_rl.training import check_inputs, demonstrations, obtain_demonstration
 

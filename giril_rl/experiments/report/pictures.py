@@ -48,10 +48,15 @@ def draw_pictures(panels: Sequence[Panel], out: Path) -> list[str]:
     """
     sections = []
     for panel in panels:
-        rows = [row for row in panel.rows if row.runs[0].is_atari and _is_generative(row)]
+        rows = [row for row in panel.rows if _is_game(row) and _is_generative(row)]
         if rows:
             sections.append(_section(panel, rows, out))
     return sections
+
+
+def _is_game(row: Row) -> bool:
+    family = row.runs[0].family
+    return family.has_lives and family.observation == "image"
 
 
 def _is_generative(row: Row) -> bool:

@@ -205,8 +205,8 @@ class Panel:
         """What the demonstration is called: one life's score is not to be read as a game's."""
         runs = [run for row in self.rows for run in row.runs]
         lives = {run.config["demo.lives"] for run in runs if "demo.lives" in run.config}
-        atari = any(run.is_atari for run in runs)
-        return "demonstration of one life" if atari and lives == {"first"} else "demonstration"
+        counted = any(run.family.has_lives for run in runs)
+        return "demonstration of one life" if counted and lives == {"first"} else "demonstration"
 
     @cached_property
     def scale(self) -> Scale:

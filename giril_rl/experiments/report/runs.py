@@ -8,8 +8,8 @@ from typing import Any
 
 import yaml
 
+from giril_rl.config.families import TaskFamily, family_of
 from giril_rl.config.leaves import flat
-from giril_rl.config.schema import is_atari
 from giril_rl.errors import UserError
 from giril_rl.files.untrusted import parse_json, parse_yaml, read_text
 from giril_rl.runs.finished import check_run_format, read_result
@@ -62,9 +62,9 @@ class RunRecord:
         return int(self.config["steps"])
 
     @property
-    def is_atari(self) -> bool:
-        """Whether its task is a game of the Arcade Learning Environment."""
-        return is_atari(str(self.config.get("task.env_id")))
+    def family(self) -> TaskFamily:
+        """The family of its task."""
+        return family_of(str(self.config.get("task.env_id")))
 
     def metrics(self) -> list[dict[str, Any]]:
         """The rows of its ``metrics.jsonl``."""

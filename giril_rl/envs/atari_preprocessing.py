@@ -1,4 +1,4 @@
-"""One Atari game with the paper's preprocessing, steppable without waiting for it."""
+"""Atari preprocessing: one game as 84 x 84 grey frames of four emulated frames each."""
 
 from __future__ import annotations
 
@@ -36,15 +36,15 @@ class Shown(NamedTuple):
 
 
 class AtariGame:
-    """An emulator in a thread of its own: :meth:`send` an action, :meth:`receive` what it shows.
+    """An emulator in its own thread: :meth:`send` an action, :meth:`receive` what it shows.
 
-    Each action is repeated for four frames, of which the last two are maximised, turned grey and
-    brought to 84 x 84, by ale-py's vector environment. A game begins with 0 to 29 frames without
-    action, drawn from the seed. Actions are executed as given (no sticky actions), rewards are not
-    clipped, and nothing happens at a lost life: that is :class:`~giril_rl.envs.AtariEnv`'s matter.
+    ale-py's vector environment repeats each action for four frames, takes the maximum of the last
+    two, turns it grey and resizes it to 84 x 84. A game begins with 0 to 29 frames without action,
+    drawn from the seed. Actions are not sticky, rewards are not clipped, and nothing happens at a
+    lost life: :class:`~giril_rl.envs.AtariEnv` stacks frames and handles lives.
 
-    One interface for each game rather than one for all: the steps that follow a lost life are taken
-    by that game alone, and the batch's order stays fixed. It costs about 4% of the steps a second.
+    Each game has its own interface so that it alone takes the steps that follow a lost life, in a
+    batch of fixed order. One interface for all would be about 4% faster.
 
     Args:
         game: the ROM's name in ale-py, such as ``"breakout"``.
@@ -77,33 +77,33 @@ class AtariGame:
 
     @property
     def fires(self) -> bool:
-        """Whether a life begins with a press of the button, as DeepMind's wrappers do it."""
+        """Whether a life begins with a press of the button, as in DeepMind's wrappers."""
         return self.meanings[1] == "FIRE" and len(self.meanings) >= 3
 
     def reset(self, seed: int | None = None) -> tuple[np.ndarray, int]:
         """Begins a game; its first frame ``(84, 84)`` and its lives.
 
         Args:
-            seed: seeds the generator of the frames without action. None draws the next number from
-                it, which takes a tenth of the time: ale-py loads the game anew to seed it. What was
-                played in between plays no part.
+            seed: seeds the generator of the frames without action, whatever was played before.
+                None draws its next number, in a tenth of the time: ale-py loads the game anew to
+                seed it.
         """
         number = -1 if seed is None else seed & 0x7FFFFFFF  # ale-py takes 31 bits.
         shown, info = self._ale.reset([0], [number])
         return shown[0, 0], int(info["lives"][0])
 
     def send(self, action: int) -> None:
-        """Lets the game play ``action`` for four frames.
+        """Starts ``action`` for four frames.
 
         Raises:
-            ValueError: if the game has no such action; ale-py would never show anything again.
+            ValueError: if the game has no such action; ale-py would wait forever.
         """
         if not 0 <= action < len(self.meanings):
             raise ValueError(f"the game has no action {action}, only 0 to {len(self.meanings) - 1}")
         self._ale.send([action], [1.0])
 
     def receive(self) -> Shown:
-        """Waits for what the last :meth:`send` led to."""
+        """Waits for the result of the last :meth:`send`."""
         frame, reward, over, cut, info = self._ale.recv()
         return Shown(
             frame[0, 0], float(reward[0]), bool(over[0]), bool(cut[0]), int(info["lives"][0])

@@ -1,28 +1,60 @@
-"""One Atari game as a Gymnasium environment: what demonstrations are recorded and replayed in."""
+"""The family of Atari games, and a game as the Gymnasium environment of demonstrations."""
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable
+from typing import Any, cast
 
 import gymnasium
 import numpy as np
 import torch
 from tensordict import TensorDict
 
+from giril_rl.config.schema import TaskConfig
 from giril_rl.envs.atari import STACK, AtariEnv, Episode
-from giril_rl.envs.atari_game import FRAME_CAP, SIDE
+from giril_rl.envs.atari_preprocessing import FRAME_CAP, SIDE, SKIP
+from giril_rl.envs.batched import BatchedEnv
+from giril_rl.envs.gym_api import import_package, registered_spec
+from giril_rl.runs.randomness import Use
+
+
+def gym_factory(task: TaskConfig) -> Callable[[], gymnasium.Env]:
+    """See :func:`giril_rl.envs.gym_factory`."""
+    arguments = _arguments(task)
+
+    def make_one() -> gymnasium.Env:
+        env = AtariGymEnv(**arguments)
+        env.spec = registered_spec(task.env_id)
+        return env
+
+    return make_one
+
+
+def make(task: TaskConfig, num_envs: int, seed: int, use: Use) -> BatchedEnv:
+    """See :func:`giril_rl.envs.make_env`."""
+    return AtariEnv(num_envs=num_envs, seed=seed, use=use, **_arguments(task))
+
+
+def _arguments(task: TaskConfig) -> dict[str, Any]:
+    import_package("ale_py", extra="atari")  # Registers the ids.
+    steps = task.max_episode_steps
+    return {
+        "game": str(registered_spec(task.env_id).kwargs["game"]),
+        "episode": cast(Episode, task.episode),
+        "frame_cap": FRAME_CAP if steps is None else SKIP * steps,
+    }
 
 
 class AtariGymEnv(gymnasium.Env):
-    """What :class:`AtariEnv` shows of a single game, in Gymnasium's terms.
+    """One game of :class:`AtariEnv` in Gymnasium's terms, to record and replay demonstrations in.
 
-    A reset with a seed begins the game of that seed. A reset without one after a lost life goes on
-    to the next life.
+    A reset with a seed begins the game of that seed. A reset without one after a lost life
+    continues with the next life.
 
     Args:
         game: the ROM's name in ale-py.
         episode: "life" or "game", see :class:`AtariEnv`.
-        frame_cap: emulated frames after which a game is cut (truncated).
+        frame_cap: emulated frames after which a game is truncated.
 
     Raises:
         UserError: as :class:`AtariEnv`.
@@ -41,7 +73,7 @@ class AtariGymEnv(gymnasium.Env):
         self.action_space = gymnasium.spaces.Discrete(int(self._env.action_spec.space.n))
 
     def get_action_meanings(self) -> list[str]:
-        """The actions' names, by ale-py's own name for this method: ``["NOOP", "FIRE", ...]``."""
+        """The actions' names, ``["NOOP", "FIRE", ...]``; the method is named as in ale-py."""
         return list(self._env.meanings)
 
     def reset(
