@@ -37,7 +37,7 @@ class Own(gymnasium.Env):
 
 gymnasium.register("Own-v0", entry_point=Own, max_episode_steps=20)
 """
-WORDS = [*TINY, "steps=16"]
+WORDS = [*TINY, "steps=16", "eval.episodes=2"]
 
 
 @pytest.fixture
