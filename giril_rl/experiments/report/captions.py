@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from typing import Any
 
-from giril_rl.experiments.report.methods import PLAYER
+from giril_rl.experiments.report.entries import PLAYER
 from giril_rl.experiments.report.reading import RunRecord
 from giril_rl.experiments.report.rows import Panel
 from giril_rl.experiments.report.settings import task_words

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from giril_rl.experiments.report.methods import PALETTE
+from giril_rl.experiments.report.entries import PALETTE
 from giril_rl.experiments.report.rows import Look, Panel, Row
 from giril_rl.experiments.report.statistics import Estimate, band, mean_and_iqm
 from giril_rl.experiments.report.tables import Table

@@ -15,6 +15,7 @@ from tensordict import TensorDictBase
 from giril_rl.config.schema import DemoConfig
 from giril_rl.demos import Demonstration
 from giril_rl.errors import UserError
+from giril_rl.experiments.report.entries import entry
 from giril_rl.experiments.report.game import (
     GAMES,
     MOST_STEPS,
@@ -22,7 +23,6 @@ from giril_rl.experiments.report.game import (
     rewards_of,
     typical_game,
 )
-from giril_rl.experiments.report.methods import entry
 from giril_rl.experiments.report.reading import RunRecord
 from giril_rl.experiments.report.rows import Panel, Row
 from giril_rl.files.disk import read_json

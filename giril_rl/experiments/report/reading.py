@@ -11,7 +11,7 @@ import yaml
 from giril_rl.config.families import TaskFamily, family_of
 from giril_rl.config.leaves import flat
 from giril_rl.errors import UserError
-from giril_rl.experiments.report.methods import PLAYER, TRUE_REWARD
+from giril_rl.experiments.report.entries import PLAYER, TRUE_REWARD
 from giril_rl.files.untrusted import parse_json, parse_yaml, read_text
 from giril_rl.runs.finished import check_run_format, read_result
 from giril_rl.runs.metrics import METRICS, read_metrics

@@ -8,7 +8,7 @@ from typing import Any
 
 from giril_rl.experiments.report.captions import caption, made_with
 from giril_rl.experiments.report.charts import draw_bars, draw_results, draw_varied
-from giril_rl.experiments.report.methods import PLAYER, TRUE_REWARD
+from giril_rl.experiments.report.entries import PLAYER, TRUE_REWARD
 from giril_rl.experiments.report.pictures import draw_pictures
 from giril_rl.experiments.report.reading import RunRecord, Unfinished, read_runs
 from giril_rl.experiments.report.rows import Panel

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, NamedTuple
 
-from giril_rl.experiments.report.methods import (
+from giril_rl.experiments.report.entries import (
     OWN,
     PLAYER,
     TRUE_REWARD,

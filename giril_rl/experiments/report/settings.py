@@ -15,7 +15,7 @@ from giril_rl.config.recipe_config import config_class
 from giril_rl.config.recipe_files import find, shipped
 from giril_rl.config.schema import AveragedRunConfig
 from giril_rl.errors import UserError
-from giril_rl.experiments.report.methods import PLAYER, TRUE_REWARD, entry, is_own
+from giril_rl.experiments.report.entries import PLAYER, TRUE_REWARD, entry, is_own
 from giril_rl.experiments.report.reading import RunRecord
 from giril_rl.methods import ControlRunConfig
 from giril_rl.rewards.method import Method, registered

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import yaml
 
-from giril_rl.experiments.report.methods import PLAYER
+from giril_rl.experiments.report.entries import PLAYER
 from giril_rl.experiments.report.reading import RunRecord
 from giril_rl.experiments.report.rows import Panel, Row, group
 from giril_rl.experiments.report.settings import Changes, text_of

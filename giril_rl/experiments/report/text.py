@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from giril_rl.experiments.report.methods import PLAYER
+from giril_rl.experiments.report.entries import PLAYER
 from giril_rl.experiments.report.rows import Panel, Row, mean
 from giril_rl.experiments.report.statistics import Estimate, mean_and_iqm
 from giril_rl.experiments.report.tables import Line, Table

@@ -3,7 +3,7 @@
 import pytest
 import yaml
 
-from giril_rl.experiments.report.methods import PALETTE
+from giril_rl.experiments.report.entries import PALETTE
 from giril_rl.experiments.report.reading import read_runs
 from giril_rl.experiments.report.tables import panels_of, tables_of
 from giril_rl.experiments.report.text import seeds_text

@@ -1,10 +1,10 @@
-"""Names, order and colours in tables and pictures: of methods, the player and your own recipes."""
+"""Registry entries of methods, and those of the player and of your own recipes."""
 
 from __future__ import annotations
 
 from functools import cache
 
-from giril_rl.methods.registry import methods
+from giril_rl.methods.registry import CONTROL, methods
 from giril_rl.rewards.method import (
     BLACK,
     BLUE,
@@ -67,7 +67,7 @@ def entry(method: str, number: int = 0) -> Method:
     if method in known:
         return known[method]
     colour = OWN[number % len(OWN)]
-    if method.startswith("control:"):
+    if method.startswith(CONTROL):
         label = method.replace(":", ": ").replace("_", " ")
         return Method(method, label, colour, kind="control")
     taken = method in {other.label for other in known.values()}  # A recipe in a file GAIL.py.
