@@ -35,7 +35,7 @@ class Look(NamedTuple):
     linestyle: str
 
 
-@dataclass
+@dataclass(eq=False)
 class Row:
     """One method with one setting and budget on one task.
 
@@ -153,7 +153,7 @@ def _numeric(text: str) -> tuple[float, str]:
         return float("inf"), text
 
 
-@dataclass
+@dataclass(eq=False)
 class Panel:
     """All rows of one task.
 

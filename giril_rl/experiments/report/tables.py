@@ -119,7 +119,7 @@ def ablations() -> tuple[Ablation, ...]:
     return tuple(Ablation(**each) for each in _paper()["ablations"])
 
 
-@dataclass
+@dataclass(eq=False)
 class Line:
     """A row as it stands in one table.
 
@@ -150,7 +150,7 @@ class Line:
         return probability_of_improvement(self.row.scores, best.scores), best
 
 
-@dataclass
+@dataclass(eq=False)
 class Table:
     """Lines of one task about one thing.
 

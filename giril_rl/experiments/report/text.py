@@ -35,16 +35,6 @@ def with_interval(estimate: Estimate, digits: int = 1) -> str:
     return f"{text} [{estimate.low:z,.{digits}f}, {estimate.high:z,.{digits}f}]"
 
 
-def joined(words: Sequence[str], between: str = ", ") -> str:
-    """A list in words.
-
-    Examples:
-        >>> joined(["a", "b", "c"]), joined(["a"])
-        ('a, b and c', 'a')
-    """
-    return " and ".join(filter(None, [between.join(words[:-1]), words[-1]]))
-
-
 def steps_text(row: Row) -> str:
     """Environment steps of a row's training; a range if runs stopped early.
 
@@ -78,21 +68,22 @@ def budget_text(rows: Iterable[Row]) -> str:
         'no environment steps'
     """
     budgets = sorted({row.steps for row in rows if row.is_trained and row.method != PLAYER})
-    return f"{joined([f'{steps:,}' for steps in budgets] or ['no'])} environment steps"
+    *first, last = [f"{steps:,}" for steps in budgets] or ["no"]
+    return f"{' and '.join(filter(None, [', '.join(first), last]))} environment steps"
 
 
 def markdown(rows: Sequence[Mapping[str, str]]) -> str:
-    r"""Rows of ``{column: text}`` as a Markdown table without its empty columns.
+    r"""Rows of ``{column: text}`` as a Markdown table; columns without any text are left out.
 
     Examples:
-        >>> print(markdown([{"run": "a|b", "n": "", "last line": ""}, {"run": "c", "n": "2"}]))
+        >>> print(markdown([{"run": "a|b", "n": "", "of": ""}, {"run": "c", "n": "2", "of": ""}]))
         | run | n |
         | --- | --- |
         | a\|b | - |
         | c | 2 |
         <BLANKLINE>
     """
-    columns = [name for name in rows[0] if any(row[name] for row in rows if name in row)]
+    columns = [name for name in rows[0] if any(row[name] for row in rows)]
     cells = [[row[name].replace("|", "\\|") or "-" for name in columns] for row in rows]
     return "".join(f"| {' | '.join(row)} |\n" for row in [columns, ["---"] * len(columns), *cells])
 
