@@ -6,6 +6,7 @@ from functools import cache
 
 import pytest
 import yaml
+from matplotlib.figure import Figure
 
 from giril_rl.config.compose import resolved
 from giril_rl.config.recipe_config import config_class
@@ -45,7 +46,7 @@ def made(tmp_path):
         values = {
             "method": method,
             "task": config.task.name,
-            "profile": config.profile,
+            "profile": getattr(config, "profile", None),
             "seed": config.seed,
             "seeds": {"policy": config.seed, "reward": config.seed + 100},
             "env_steps": trained,
@@ -65,3 +66,13 @@ def made(tmp_path):
 
     write.root = tmp_path / "runs"
     return write
+
+
+@pytest.fixture
+def drawn(monkeypatch):
+    """The figures that are saved."""
+    figures, savefig = [], Figure.savefig
+    monkeypatch.setattr(
+        Figure, "savefig", lambda self, *a, **k: (savefig(self, *a, **k), figures.append(self))
+    )
+    return figures

@@ -1,16 +1,17 @@
-"""Run folders read for a report: settings, result, and what became of those without one."""
+"""Reads run folders: settings and results, and the state of runs without a result."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import yaml
 
 from giril_rl.config.families import TaskFamily, family_of
 from giril_rl.config.leaves import flat
 from giril_rl.errors import UserError
+from giril_rl.experiments.report.entries import PLAYER, TRUE_REWARD
 from giril_rl.files.untrusted import parse_json, parse_yaml, read_text
 from giril_rl.runs.finished import check_run_format, read_result
 from giril_rl.runs.metrics import METRICS, read_metrics
@@ -18,20 +19,20 @@ from giril_rl.runs.metrics import METRICS, read_metrics
 
 @dataclass(frozen=True)
 class RunRecord:
-    """One run's folder.
+    """A finished run.
 
     Attributes:
-        folder: the folder.
-        name: the folder as seen from the folder that is reported on.
+        folder: its folder.
+        name: that folder relative to the folder of the report.
         config: its settings as ``{dotted key: value}``.
-        result: what ``result.json`` holds, None for an unfinished run.
-        below: the folder that is reported on.
+        result: the content of ``result.json``.
+        below: the folder of the report.
     """
 
     folder: Path
     name: str
     config: dict[str, Any]
-    result: dict[str, Any] | None
+    result: dict[str, Any]
     below: Path
 
     @property
@@ -41,15 +42,30 @@ class RunRecord:
 
     @property
     def method(self) -> str:
-        """The recipe's name, whatever its result says; a control's with its reward."""
-        if self.recipe != "control":
-            return self.recipe
-        return str((self.result or {}).get("method", f"control:{self.config.get('reward')}"))
+        """The recipe's name; ``control:REWARD`` of a control.
+
+        An expert that trains for its whole budget is a method of its own.
+        """
+        if self.recipe == PLAYER and self.config.get("stop_early") is False:
+            return TRUE_REWARD
+        if self.recipe == "control":
+            return str(self.result.get("method", f"control:{self.config.get('reward')}"))
+        return self.recipe
 
     @property
-    def score(self) -> float | None:
-        """Mean return of the policy as trained; None for an unfinished run."""
-        return None if self.result is None else float(self.result["return_mean"])
+    def task(self) -> str:
+        """The task's name."""
+        return str(self.config["task.name"])
+
+    @property
+    def env_id(self) -> str:
+        """The id of the task's environment."""
+        return str(self.config.get("task.env_id"))
+
+    @property
+    def score(self) -> float:
+        """Mean return of the policy as trained."""
+        return float(self.result["return_mean"])
 
     @property
     def seed(self) -> int:
@@ -58,28 +74,29 @@ class RunRecord:
 
     @property
     def steps(self) -> int:
-        """The budget that the run was given."""
+        """The budget of environment steps."""
         return int(self.config["steps"])
 
     @property
     def family(self) -> TaskFamily:
         """The family of its task."""
-        return family_of(str(self.config.get("task.env_id")))
+        return family_of(self.env_id)
+
+    @property
+    def has_demonstration(self) -> bool:
+        """Whether it learned from a demonstration."""
+        return any(self.result.get(key) is not None for key in ("demo_transitions", "demo_id"))
 
     def metrics(self) -> list[dict[str, Any]]:
         """The rows of its ``metrics.jsonl``."""
         return read_metrics(self.folder / METRICS)
 
 
-@dataclass(frozen=True)
-class Unfinished:
-    """A run without a result.
+class Unfinished(NamedTuple):
+    """A run without a result, named like a finished one.
 
-    Attributes:
-        name: its folder as seen from the folder that is reported on.
-        state: in words: failed, interrupted, unfinished, not finished yet.
-        steps: environment steps on record, and the budget.
-        reason: the last line of its log, where a study knows one.
+    The state is failed, interrupted, unfinished or not finished yet; the steps are those so far and
+    the budget; the reason is the last line of its log, where a study knows it.
     """
 
     name: str
@@ -89,42 +106,31 @@ class Unfinished:
 
 
 def read_runs(folder: Path) -> tuple[list[RunRecord], list[Unfinished]]:
-    """All runs below a folder: the finished ones, and what is known of the others.
-
-    Args:
-        folder: where runs are, at any depth.
+    """All runs below a folder, at any depth: the finished ones and the others.
 
     Raises:
-        UserError: where there is no finished run, or a result cannot be read.
+        UserError: if no run is finished or a result cannot be read.
     """
     finished: list[RunRecord] = []
     others: dict[str, Unfinished] = {}
     known = _standings(folder)
     for path in sorted(folder.rglob("config.yaml")):
-        name = path.parent.relative_to(folder).as_posix()
+        run, name = path.parent, path.parent.relative_to(folder).as_posix()
         config = _config(path)
         if config is None:
             others[name] = Unfinished(name, "unfinished", "", "its config.yaml cannot be read")
-            continue
-        if not {"recipe", "task.name", "seed", "steps"} <= set(config):
+        elif not {"recipe", "task.name", "seed", "steps"} <= set(config):
             continue  # Another program's config.yaml.
-        if not all(type(config[key]) is int for key in ("seed", "steps")):
+        elif not all(type(config[key]) is int for key in ("seed", "steps")):
             others[name] = Unfinished(name, "unfinished", "", "its config.yaml is not a run's")
-            continue
-        result = None
-        if path.with_name("result.json").exists():
-            result = read_result(path.parent)
+        elif (run / "result.json").exists():
+            finished.append(RunRecord(run, name, config, read_result(run), folder))
         else:
-            check_run_format(path.parent)
-        record = RunRecord(path.parent, name, config, result, folder)
-        if record.result is not None:
-            finished.append(record)
-        else:
-            taken = max(
-                (row["step"] for row in record.metrics() if row["phase"] == "ppo"), default=0
-            )
+            check_run_format(run)
+            rows = [row for row in read_metrics(run / METRICS) if row["phase"] == "ppo"]
+            taken = max((row["step"] for row in rows), default=0)
             state, reason = known.pop(name, ("unfinished", ""))
-            others[name] = Unfinished(name, state, f"{taken:,} of {record.steps:,}", reason)
+            others[name] = Unfinished(name, state, f"{taken:,} of {config['steps']:,}", reason)
     for name, (state, reason) in known.items():
         if not (folder / name / "result.json").exists():
             others.setdefault(name, Unfinished(name, state, "", reason))
@@ -144,7 +150,7 @@ def _config(path: Path) -> dict[str, Any] | None:
     return flat(config) if isinstance(config, dict) else None
 
 
-# A study that was killed has left its runs "running".
+# A study that was killed leaves its runs "running".
 _STATES = {
     "failed": "failed",
     "interrupted": "interrupted",
@@ -154,17 +160,16 @@ _STATES = {
 
 
 def _standings(folder: Path) -> dict[str, tuple[str, str]]:
-    """State and last line of what studies below the folder did not finish, by run folder."""
+    """State and last line of the runs that studies below the folder did not finish, by folder."""
     found: dict[str, tuple[str, str]] = {}
     for path in sorted(folder.glob("**/studies/*/status.json")):
         root = path.parents[2]
         try:
-            rows = parse_json(read_text(path))["runs"]
-            for row in rows:
+            for row in parse_json(read_text(path))["runs"]:
                 state = _STATES.get(row["state"])
                 place = (root / row["folder"]).relative_to(folder).as_posix()
                 if ".." in Path(place).parts:
-                    continue  # Not of this folder.
+                    continue  # Outside this folder.
                 if state and found.get(place, ("",))[0] != "failed":
                     found[place] = (state, str(row["last_line"] or ""))
         except (OSError, ValueError, KeyError, TypeError):

@@ -3,11 +3,11 @@
 import pytest
 import yaml
 
-from giril_rl.experiments.report.formats import seeds_text
-from giril_rl.experiments.report.rows import panels_of
-from giril_rl.experiments.report.runs import read_runs
-from giril_rl.experiments.report.style import PALETTE
-from giril_rl.experiments.report.tables import tables_of
+from giril_rl.experiments.report.entries import PALETTE
+from giril_rl.experiments.report.reading import read_runs
+from giril_rl.experiments.report.tables import panels_of, tables_of
+from giril_rl.experiments.report.text import seeds_text
+from giril_rl.rewards.method import BLUE, Method, register, unregister
 
 
 def panels(made):
@@ -60,22 +60,11 @@ def test_methods_profiles_budgets_and_settings_make_rows_of_their_own(made):
 
 def test_a_profile_without_effect_makes_no_row_and_a_repeat_is_named(made):
     made("gail", score=1.0)
-    repeat = made("gail", "profile=paper", score=1.0)
+    repeat = made("gail", score=1.0, name="later", extra={"profile": "paper"})
     (panel,) = panels(made)
     (row,) = panel.rows
     assert (row.name, row.seeds) == ("GAIL", [0])
     assert [run.folder for run in panel.repeats] == [repeat]
-
-
-def test_a_controls_reward_is_its_name(made):
-    made("control", score=1.0)
-    made("control", "reward=copy", score=2.0)
-    made("control", "reward=random", score=3.0)
-    assert {(row.name, row.settings) for row in rows(made).values()} == {
-        ("control: constant", ""),
-        ("control: copy", ""),
-        ("control: random", ""),
-    }
 
 
 def test_what_changes_the_task_makes_a_panel_without_the_papers_numbers(made):
@@ -93,6 +82,16 @@ def test_what_changes_the_task_makes_a_panel_without_the_papers_numbers(made):
         for title, panel in found.items()
     }
     assert list(papers.values()) == [[None], [990.2], [None]]
+
+
+def test_runs_without_a_termination_join_those_that_have_one(made):
+    made("giril", "termination=bootstrap", score=1.0)
+    made("bc", score=2.0)
+    (panel,) = panels(made)
+    assert [row.name for row in panel.rows] == ["GIRIL (released)", "BC"]
+    made("giril", score=1.0)
+    plain, changed = panels(made)
+    assert [len(each.rows) for each in (plain, changed)] == [2, 1]
 
 
 def test_how_long_an_expert_trains_makes_no_other_task(made):
@@ -180,6 +179,30 @@ def test_controls_are_not_told_apart_by_what_they_do_not_read(made):
     (panel,) = panels(made)
     assert panel.shared == (("demo.path", "mine"), ("ppo.lr", "0.1"))
     assert len(panel.main) == 4
+
+
+@pytest.fixture
+def registered():
+    """Two more methods in the registry, of which the control has no reward."""
+    zero = Method("control:zero", "zeros", "#654321", kind="control", trained="never", rank=300)
+    found = [Method("red", "RED", "#123456"), zero]
+    yield [register(method) for method in found]
+    for method in found:
+        unregister(method.name)
+
+
+def test_the_report_learns_of_a_method_from_its_entry(made, registered):
+    made("giril", score=1.0)
+    made("giril", score=2.0, name="red", extra={"recipe": "red"}, profile=None)
+    for seed, lr in ((0, "0.1"), (1, "0.2")):
+        words = (f"seed={seed}", f"ppo.lr={lr}")
+        made("control", *words, score=3.0, extra={"reward": "zero"}, method="control:zero")
+    (panel,) = panels(made)
+    assert [(row.name, row.seeds, row.is_control, row.look.color) for row in panel.rows] == [
+        ("GIRIL (released)", [0], False, BLUE),
+        ("RED", [0], False, "#123456"),
+        ("zeros", [0, 1], True, "#654321"),
+    ]
 
 
 def test_what_all_runs_share_is_the_panels_and_no_rows(made):

@@ -2,11 +2,9 @@
 
 import pytest
 
-from giril_rl.experiments.report.normalised import what_is_missing
-from giril_rl.experiments.report.origins import intervals_text
-from giril_rl.experiments.report.rows import panels_of
-from giril_rl.experiments.report.runs import read_runs
-from giril_rl.experiments.report.tables import tables_of
+from giril_rl.experiments.report.captions import intervals_text, what_is_missing
+from giril_rl.experiments.report.reading import read_runs
+from giril_rl.experiments.report.tables import panels_of, tables_of
 
 
 def panel(made):
@@ -58,8 +56,7 @@ def test_a_missing_player_is_named_with_the_command_that_has_it(made):
     made("control", *words, "reward=random", score=10.0)
     made("giril", *words, "seed=5", score=50.0, expert_return_mean=None, name="theirs")
     command = (
-        "`giril run bc task=inverted_pendulum task.horizon=fixed termination=bootstrap "
-        f"-m seed=0,3,4 root={made.root}`"
+        f"`giril run bc task=inverted_pendulum task.horizon=fixed -m seed=0,3,4 root={made.root}`"
     )
     assert what_is_missing(panel(made)) == (
         f"Not all are normalised: no run tells the score of the player of seeds 0, 3, 4; {command} "

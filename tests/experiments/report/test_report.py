@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from giril_rl.cli.command_line import main
-from giril_rl.experiments.report.curves import binned_curve, row_curves
-from giril_rl.experiments.report.rows import panels_of
-from giril_rl.experiments.report.runs import read_runs
+from giril_rl.experiments.report.charts import binned_curve, row_curves
+from giril_rl.experiments.report.reading import read_runs
+from giril_rl.experiments.report.tables import panels_of
 
 
 @pytest.fixture
@@ -168,7 +168,7 @@ def test_runs_without_a_result_are_listed(runs, capsys):
     place = "giril/inverted_pendulum"
     assert text.split("## Without a result")[1].strip().splitlines() == [
         "| run | state | steps | last line |",
-        "|---|---|---|---|",
+        "| --- | --- | --- | --- |",
         f"| `{place}/seed=30` | not finished yet | - | - |",
         f"| `{place}/seed=7` | unfinished | - | its config.yaml cannot be read |",
         f"| `{place}/seed=8` | unfinished | 300,000 of 300,000 | - |",
@@ -206,19 +206,6 @@ def test_curves_of_a_row(runs):
     assert steps.tolist() == [75_000, 150_000, 225_000, 300_000]
     assert curves.tolist() == [[s / 4, s / 2, s * 0.75, s] for s in (900.0, 901.0, 902.0)]
     assert row_curves(rows["BC", ""]) is None
-
-
-@pytest.fixture
-def drawn(monkeypatch):
-    """The figures that are saved."""
-    from matplotlib.figure import Figure
-
-    figures = []
-    savefig = Figure.savefig
-    monkeypatch.setattr(
-        Figure, "savefig", lambda self, *a, **k: (savefig(self, *a, **k), figures.append(self))
-    )
-    return figures
 
 
 def test_the_legend_covers_no_curve(runs, drawn, tmp_path):
