@@ -7,8 +7,7 @@ import pytest
 
 from giril_rl.cli.command_line import main
 from giril_rl.config.compose import resolved
-from giril_rl.config.recipe_config import config_class
-from giril_rl.config.recipe_files import find
+from giril_rl.config.recipes import config_class, find
 from giril_rl.errors import UserError
 from giril_rl.files.checkpoint import load_state
 from giril_rl.runs.metrics import read_metrics

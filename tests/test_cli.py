@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 
 from giril_rl.cli.command_line import main
-from giril_rl.config import recipe_files as recipes
-from giril_rl.config.leaves import leaves
-from giril_rl.config.recipe_config import config_class
+from giril_rl.config import recipes
+from giril_rl.config.knobs import knobs
+from giril_rl.config.recipes import config_class
 
 FAKE = '''"""Fake: writes what it was given.
 
@@ -168,10 +168,10 @@ def test_help_shows_every_knob_with_default_and_help(recipe, capsys, monkeypatch
     page = capsys.readouterr().out
     words = " ".join(page.split())
     lines = {line.split()[0]: line.split() for line in page.splitlines() if line.startswith("  ")}
-    for leaf in leaves(config_class(recipe)):
-        assert leaf.help, leaf.key
-        assert leaf.help in words
-        assert len(lines[leaf.key]) >= 3
+    for knob in knobs(config_class(recipe)):
+        assert knob.help, knob.key
+        assert knob.help in words
+        assert len(lines[knob.key]) >= 3
     assert "inverted_pendulum (default)" in page
     assert "released (default)" in page
 

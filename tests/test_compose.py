@@ -4,8 +4,7 @@ import pytest
 
 from giril_rl.config.compose import groups, resolved
 from giril_rl.config.overrides import sweep
-from giril_rl.config.recipe_config import config_class
-from giril_rl.config.recipe_files import copy, find, shipped
+from giril_rl.config.recipes import config_class, copy, find, shipped
 from giril_rl.config.schema import RunConfig, TaskConfig
 from giril_rl.errors import UserError
 from giril_rl.runs.naming import config_hash, out_folder, safe, variant

@@ -2,17 +2,14 @@
 
 import pytest
 
-from giril_rl.config.jobs import Jobs
-from giril_rl.config.recipe_config import config_class
-from giril_rl.config.recipe_files import copy, find
+from giril_rl.config.compose import Composer
+from giril_rl.config.recipes import config_class, copy, find
 from giril_rl.runs.naming import out_folder
-
-JOBS = Jobs()
 
 
 def folder(*texts, recipe="giril"):
     found = find(recipe)
-    job = JOBS.job(found, config_class(found), texts)
+    job = Composer(found, config_class(found)).job(texts)
     return out_folder(found.name, job.config, job.changes).as_posix()
 
 
@@ -69,13 +66,13 @@ def test_a_seed_that_another_setting_follows_is_composed_with_it(tmp_path):
     file, settings = copy(find("giril"), tmp_path / "mine.py")
     settings.write_text(settings.read_text() + "expert: {seed: '${seed}'}\n")
     recipe = find(str(file))
-    job = JOBS.job(recipe, config_class(recipe), ["seed=7"])
+    job = Composer(recipe, config_class(recipe)).job(["seed=7"])
     assert (job.config.seed, job.config.expert.seed) == (7, 7)
 
 
 def test_the_words_kept_make_the_same_configuration():
     recipe = find("giril")
-    schema = config_class(recipe)
-    job = JOBS.job(recipe, schema, ["logger=null", "profile=paper", "seed=3", "batch_mean=false"])
+    composer = Composer(recipe, config_class(recipe))
+    job = composer.job(["logger=null", "profile=paper", "seed=3", "batch_mean=false"])
     assert job.words == ("logger=null", "profile=paper", "seed=3")
-    assert JOBS.job(recipe, schema, job.words).config == job.config
+    assert composer.job(job.words).config == job.config

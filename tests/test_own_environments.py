@@ -11,7 +11,7 @@ import pytest
 from giril_rl.cli.command_line import main
 from giril_rl.config.compose import resolved
 from giril_rl.config.imports import import_modules
-from giril_rl.config.recipe_config import config_class
+from giril_rl.config.recipes import config_class
 from giril_rl.experiments.study.plan import Planner
 from giril_rl.experiments.study.spec import read_spec
 

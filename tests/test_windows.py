@@ -4,7 +4,7 @@ import runpy
 import signal
 from types import SimpleNamespace
 
-from giril_rl.experiments.study.local import LocalLauncher
+from giril_rl.experiments.study.launchers import LocalLauncher
 from giril_rl.graphs.compiled import _compiling
 
 
@@ -18,7 +18,7 @@ def test_runs_are_killed_without_the_signals_name(monkeypatch):
     launcher._running["run"] = None, process
     launcher.close()
     assert said == ["kill", "wait"]
-    assert runpy.run_module("giril_rl.experiments.study.on_ray")["KILLED"] == code
+    assert runpy.run_module("giril_rl.experiments.study.launchers")["KILLED"] == code
 
 
 def test_compiling_blocks_no_signals(monkeypatch):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import NoReturn
 
-from giril_rl.config.schema import MOST
+from giril_rl.config.knobs import MOST
 from giril_rl.errors import UserError
 
 

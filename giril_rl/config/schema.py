@@ -1,64 +1,19 @@
-"""The typed knobs of every recipe, one dataclass for each part.
+"""The settings of every recipe, one dataclass for each part.
 
-A field's type is what Hydra enforces, its default is the value used, its ``help`` is the line that
-``giril run RECIPE --help`` shows, and its ``choices`` or bounds are what
-:func:`giril_rl.config.validation.validate` checks. Nothing heavy is imported here.
+Hydra enforces a field's type; :func:`giril_rl.config.validation.validate` checks its bounds and
+choices; ``giril run RECIPE --help`` shows its line of help. Nothing heavy is imported here.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 from omegaconf import MISSING
 
-MOST = 2**63 - 1
-"""The largest whole number of any knob: what torch takes for a seed or a size, and files keep."""
+from giril_rl.config.knobs import knob
+
 MOST_THREADS = 1024
 COMPILE = "torch.compile of gradient steps: for long training on frames, 20 seconds to begin"
-
-
-def knob(
-    default: Any,
-    help: str,
-    *,
-    choices: Sequence[str] | None = None,
-    low: float | None = None,
-    high: float | None = None,
-    low_open: bool = False,
-    high_open: bool = False,
-) -> Any:
-    """A dataclass field with a default, one line of help and what its value may be.
-
-    Args:
-        default: value used when nothing else is said; ``MISSING`` makes the knob mandatory.
-        help: one line, shown by ``--help``.
-        choices: the only texts allowed.
-        low: smallest number allowed; in a list, of each entry.
-        high: largest number allowed; in a list, of each entry.
-        low_open: ``low`` itself is not allowed.
-        high_open: ``high`` itself is not allowed.
-
-    Examples:
-        >>> from dataclasses import dataclass, fields
-        >>> @dataclass
-        ... class Part:
-        ...     beta: float = knob(1.0, "a weight in (0, 1]", low=0, high=1, low_open=True)
-        >>> Part().beta, fields(Part)[0].metadata["help"]
-        (1.0, 'a weight in (0, 1]')
-    """
-    metadata = {
-        "help": help,
-        "choices": tuple(choices) if choices else None,
-        "low": low,
-        "high": high,
-        "low_open": low_open,
-        "high_open": high_open,
-    }
-    if isinstance(default, list):
-        return field(default_factory=lambda: list(default), metadata=metadata)
-    return field(default=default, metadata=metadata)
 
 
 def split_id(env_id: str) -> tuple[str | None, str]:

@@ -1,16 +1,16 @@
-"""Values of the right type that are wrong all the same, refused before anything is trained."""
+"""Semantic checks of config values, before anything is trained."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import fields, is_dataclass
+from functools import cache
+from operator import attrgetter
 from typing import Any
 
 from giril_rl.config.imports import check_names
-from giril_rl.config.leaves import leaves
+from giril_rl.config.knobs import Knob, default_text, knobs
 from giril_rl.config.schema import (
-    MOST,
     BCConfig,
     DemoConfig,
     ExpertConfig,
@@ -19,30 +19,8 @@ from giril_rl.config.schema import (
     RunConfig,
     TaskConfig,
 )
-from giril_rl.config.task_defaults import apply_task_defaults
+from giril_rl.config.tasks import apply_task_defaults
 from giril_rl.errors import UserError
-
-
-def _show(value: Any) -> str:
-    return "null" if value is None else str(value).replace(" ", "")
-
-
-def _range(metadata: Any) -> str:
-    low, high = metadata.get("low"), metadata.get("high")
-    if high is None:
-        return f"{'above' if metadata['low_open'] else 'at least'} {low:g}"
-    if low is None:
-        return f"{'below' if metadata['high_open'] else 'at most'} {high:g}"
-    left = "(" if metadata["low_open"] else "["
-    right = ")" if metadata["high_open"] else "]"
-    return f"in {left}{low:g}, {high:g}{right}"
-
-
-def _inside(number: float, metadata: Any) -> bool:
-    low, high = metadata.get("low"), metadata.get("high")
-    if low is not None and (number < low or (number == low and metadata["low_open"])):
-        return False
-    return high is None or number < high or (number == high and not metadata["high_open"])
 
 
 def _check_ppo(key: str, ppo: PPOConfig) -> None:
@@ -119,7 +97,7 @@ def _check_layers(config: RunConfig) -> None:
         for name in ("hidden", "model_hidden"):
             if hasattr(value, name) and getattr(value, name) != getattr(type(value)(), name):
                 raise UserError(
-                    f"{part.name}.{name}={_show(getattr(value, name))} is for vectors, and "
+                    f"{part.name}.{name}={default_text(getattr(value, name))} is for vectors, and "
                     f"{config.task.name} has frames, whose layers are fixed: leave it out."
                 )
 
@@ -138,10 +116,11 @@ def _check_run(config: Any) -> None:
 
 
 def _check_demo(key: str, demo: DemoConfig) -> None:
+    length, episodes = default_text(demo.length), default_text(demo.episodes)
     if (demo.length is None) == (demo.episodes is None):
         raise UserError(
-            f"{key}.length={_show(demo.length)} and {key}.episodes={_show(demo.episodes)}: "
-            "give exactly one of them and set the other to null."
+            f"{key}.length={length} and {key}.episodes={episodes}: give exactly one of them and "
+            "set the other to null."
         )
     if demo.length is not None and demo.subsample > demo.length:
         raise UserError(
@@ -169,7 +148,7 @@ def _check_parts(config: Any, prefix: str = "") -> None:
 
 
 def validate(config: Any) -> None:
-    """Check every knob's choices and bounds, then what single knobs cannot tell.
+    """Check every knob's type, bounds and choices, then what single knobs cannot tell.
 
     Numbers must be finite; a list's entries are checked one by one; null passes where the type
     has it.
@@ -181,35 +160,21 @@ def validate(config: Any) -> None:
         UserError: names the first key whose value is refused.
 
     Examples:
-        >>> from giril_rl.config.schema import GenerativeConfig
-        >>> validate(GenerativeConfig(beta=0.0))
+        >>> from giril_rl.config.schema import PPOConfig
+        >>> validate(PPOConfig(lr=0.0))
         Traceback (most recent call last):
         ...
-        giril_rl.errors.UserError: beta=0.0 must be in (0, 1].
+        giril_rl.errors.UserError: lr=0.0 must be greater than 0.
     """
-    for leaf in leaves(type(config)):
-        value = config
-        for name in leaf.key.split("."):
-            value = getattr(value, name)
-        if value is None:
-            continue
-        if leaf.choices and value not in leaf.choices:
-            allowed = ", ".join(leaf.choices) + (", null" if leaf.optional else "")
-            raise UserError(f"{leaf.key}={_show(value)}: choose one of {allowed}.")
-        for number in value if isinstance(value, list) else [value]:
-            if isinstance(number, (str, bool)):
-                continue
-            if isinstance(number, int) and abs(number) > MOST:
-                shown = _show(value) if len(_show(value)) < 100 else "..."
-                raise UserError(f"{leaf.key}={shown}: at most {MOST} is possible.")
-            if not math.isfinite(number):
-                raise UserError(f"{leaf.key}={_show(value)}: a finite number is needed.")
-            if not _inside(number, leaf.metadata):
-                each = ": each entry" if isinstance(value, list) else ""
-                words = f"{each} must be {_range(leaf.metadata)}"
-                raise UserError(f"{leaf.key}={_show(value)}{words}.")
+    for knob in _knobs(type(config)):
+        knob.check(attrgetter(knob.key)(config))
     _check_parts(config)
     _check_run(config)
+
+
+@cache
+def _knobs(config: type[Any]) -> tuple[Knob, ...]:
+    return tuple(knobs(config))
 
 
 def notices(config: Any) -> list[str]:

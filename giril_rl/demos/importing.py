@@ -52,7 +52,7 @@ def import_demonstration(
     Examples:
         >>> import tempfile
         >>> from giril_rl.demos import record_demonstration, to_npz
-        >>> from giril_rl.demos.task import named_task
+        >>> from giril_rl.demos import named_task
         >>> cartpole = named_task(None, "CartPole-v1")
         >>> demo = record_demonstration(
         ...     gym_factory(cartpole), lambda o: o.new_ones(1).long(), episodes=2, seed=0

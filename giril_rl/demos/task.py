@@ -1,4 +1,4 @@
-"""The task that a demonstration is of, by the name that a recipe takes or by a Gymnasium id."""
+"""The task that a demonstration is of: its spaces, and whether they fit."""
 
 from __future__ import annotations
 
@@ -6,55 +6,20 @@ import re
 from collections.abc import Sequence
 from dataclasses import replace
 
-from omegaconf import OmegaConf
 from torchrl.data import TensorSpec
 
-from giril_rl.config.nearest import did_you_mean
-from giril_rl.config.recipe_files import shipped_conf
 from giril_rl.config.schema import TaskConfig, split_id
 from giril_rl.demos.check import check_demonstration
 from giril_rl.demos.demonstration import Demonstration
 from giril_rl.envs import make_env, with_own_episodes
 from giril_rl.errors import UserError
 
-_OPEN = ("atari", "gymnasium")  # These are completed by an id.
-
-
-def named_task(name: str | None, env_id: str | None, title: str | None = None) -> TaskConfig:
-    """The task ``name`` of the shipped ones, or that of a Gymnasium id.
-
-    Args:
-        name: as in ``task=breakout``.
-        env_id: as in ``task.env_id=Pendulum-v1``, instead of ``name``.
-        title: what tables call the task of an id; the id itself if None.
-
-    Raises:
-        UserError: unless exactly one of ``name`` and ``env_id`` is given, or for an unknown name.
-
-    Examples:
-        >>> named_task("breakout", None).env_id, named_task(None, "Pendulum-v1").name
-        ('ALE/Breakout-v5', 'Pendulum-v1')
-    """
-    if (name is None) == (env_id is None):
-        raise UserError("say which task it is of: give either --task NAME or --env-id ID.")
-    if env_id is not None:
-        return TaskConfig(name=title or env_id, env_id=env_id)
-    files = {file.stem: file for file in (shipped_conf() / "task").glob("*.yaml")}
-    files = {stem: file for stem, file in files.items() if stem not in _OPEN}
-    if name not in files:
-        hint = did_you_mean(str(name), files) or f": choose one of {', '.join(sorted(files))}."
-        raise UserError(f"--task {name} is not a task{hint}")
-    built = OmegaConf.to_object(
-        OmegaConf.merge(OmegaConf.structured(TaskConfig), OmegaConf.load(files[name]))
-    )
-    assert isinstance(built, TaskConfig)
-    return built
-
 
 def spaces_of(task: TaskConfig) -> tuple[Sequence[int], TensorSpec]:
     """Shape of an observation of ``task``, and the spec of its actions.
 
     Examples:
+        >>> from giril_rl.config.tasks import named_task
         >>> shape, spec = spaces_of(named_task(None, "CartPole-v1"))
         >>> list(shape), int(spec.space.n)
         ([4], 2)
@@ -98,6 +63,7 @@ def as_recorded_task(task: TaskConfig, lives: object) -> TaskConfig:
     """The task as ``lives`` of a demonstration is recorded: "first", or whole games.
 
     Examples:
+        >>> from giril_rl.config.tasks import named_task
         >>> as_recorded_task(named_task("breakout", None), "all").episode
         'game'
     """

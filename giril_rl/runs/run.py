@@ -13,7 +13,9 @@ from typing import Any, TypeVar
 import yaml
 from filelock import FileLock, Timeout
 
+from giril_rl.config.knobs import flat
 from giril_rl.errors import UserError, told
+from giril_rl.files.checkpoint import load_state, save_state
 from giril_rl.files.disk import (
     installed_versions,
     missing,
@@ -24,13 +26,11 @@ from giril_rl.files.disk import (
     write_json,
 )
 from giril_rl.files.formats import RUN_FORMAT, check_run_format
-from giril_rl.runs.naming import NO_EFFECT, without_added
 from giril_rl.files.places import cannot_write, check_place
-from giril_rl.config.leaves import flat
-from giril_rl.runs.sources import sources_of
-from giril_rl.files.checkpoint import load_state, save_state
-from giril_rl.runs.metrics import METRICS, MetricsFile, check_logger, end_logger, make_logger
 from giril_rl.files.untrusted import parse_yaml, read_text
+from giril_rl.runs.metrics import METRICS, MetricsFile, check_logger, end_logger, make_logger
+from giril_rl.runs.naming import NO_EFFECT, without_added
+from giril_rl.runs.sources import sources_of
 
 FIRST_FILES = ("config.yaml", "versions.json")
 """What a run's folder holds before its first part has come to anything."""

@@ -14,9 +14,9 @@ from contextvars import ContextVar
 from pathlib import Path
 from typing import Any
 
+from giril_rl.config.recipes import Recipe
 from giril_rl.errors import UserError
 from giril_rl.files.disk import read_json
-from giril_rl.config.recipe_files import Recipe
 
 _making: ContextVar[tuple[Path, dict[str, str]] | None] = ContextVar("making", default=None)
 
@@ -31,7 +31,7 @@ def sources(recipe: Recipe, modules: Iterable[str]) -> dict[str, str]:
         modules: names of modules; nothing is imported. Packages are passed over.
 
     Examples:
-        >>> from giril_rl.config.recipe_files import find
+        >>> from giril_rl.config.recipes import find
         >>> sources(find("giril"), [])
         {}
     """

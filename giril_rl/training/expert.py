@@ -20,7 +20,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from giril_rl.config.imports import import_modules, modules_of
 from giril_rl.config.schema import DemoConfig, ExpertConfig, ExpertRunConfig, RunConfig, TaskConfig
-from giril_rl.config.task_defaults import apply_task_defaults
+from giril_rl.config.tasks import apply_task_defaults
 from giril_rl.demos import Demonstration, check_demonstration, record_demonstration
 from giril_rl.demos.shipped import demonstration_folder
 from giril_rl.demos.task import as_recorded_task, check_environment, spaces_of

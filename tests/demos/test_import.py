@@ -15,9 +15,8 @@ sys.path.insert(0, str(Path(__file__).parent))
 import datasets
 
 from giril_rl.cli.command_line import main
-from giril_rl.demos import Demonstration, record_demonstration, to_npz
+from giril_rl.demos import Demonstration, named_task, record_demonstration, to_npz
 from giril_rl.demos.importing import import_demonstration
-from giril_rl.demos.task import named_task
 from giril_rl.envs import AtariGymEnv
 from giril_rl.errors import UserError
 

@@ -347,9 +347,8 @@ def test_each_fault_is_one_sentence(case, capsys):
     ],
 )
 def test_wrong_words_are_one_sentence(argv, sentence, capsys):
-    from giril_rl.demos import Demonstration
+    from giril_rl.demos import Demonstration, named_task
     from giril_rl.demos.importing import import_demonstration
-    from giril_rl.demos.task import named_task
 
     demo = import_demonstration(columns(), named_task(None, datasets.ENV))
     demo.save("demo")

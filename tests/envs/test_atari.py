@@ -10,7 +10,7 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torchrl.envs.utils import check_env_specs
 
-from giril_rl.config.recipe_files import shipped_conf
+from giril_rl.config.recipes import shipped_conf
 from giril_rl.config.schema import TaskConfig
 from giril_rl.envs import AtariEnv, AtariGymEnv, for_scores, gym_factory, make_env
 from giril_rl.envs.atari import Opened

@@ -7,7 +7,7 @@ import gymnasium
 import pytest
 
 from giril_rl.cli.command_line import main
-from giril_rl.config.recipe_files import copy, find
+from giril_rl.config.recipes import copy, find
 from giril_rl.config.schema import TaskConfig
 from giril_rl.envs import GymVectorEnv, make_env
 from giril_rl.files.checkpoint import load_state

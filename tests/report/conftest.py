@@ -8,8 +8,7 @@ import pytest
 import yaml
 
 from giril_rl.config.compose import resolved
-from giril_rl.config.recipe_config import config_class
-from giril_rl.config.recipe_files import find
+from giril_rl.config.recipes import config_class, find
 from giril_rl.runs.naming import config_hash
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from giril_rl.training import finished
+from giril_rl.runs import finished
 
 RECIPE = '''"""Fake: a result after no work; `how` says how to fail."""
 

@@ -8,8 +8,7 @@ from types import ModuleType, SimpleNamespace
 import pytest
 
 from giril_rl.errors import UserError
-from giril_rl.experiments.study.local import LocalLauncher
-from giril_rl.experiments.study.on_ray import RayLauncher
+from giril_rl.experiments.study.launchers import LocalLauncher, RayLauncher
 
 
 def a_run(name, device="cuda"):

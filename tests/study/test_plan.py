@@ -8,7 +8,7 @@ import pytest
 
 from giril_rl.cli.command_line import main
 from giril_rl.config.compose import groups
-from giril_rl.config.recipe_files import find
+from giril_rl.config.recipes import find
 from giril_rl.errors import UserError
 from giril_rl.experiments.study.plan import Planner
 from giril_rl.experiments.study.spec import find_study, read_spec, shipped_studies

@@ -8,7 +8,7 @@ from typing import Any
 
 import yaml
 
-from giril_rl.config.leaves import flat
+from giril_rl.config.knobs import flat
 from giril_rl.config.schema import is_atari
 from giril_rl.errors import UserError
 from giril_rl.files.formats import check_run_format

@@ -9,7 +9,7 @@ from dataclasses import asdict
 from functools import cache
 from typing import Any
 
-from giril_rl.config.leaves import flat
+from giril_rl.config.knobs import flat
 from giril_rl.errors import UserError
 from giril_rl.experiments.report.runs import RunRecord
 from giril_rl.experiments.report.style import TRUE_REWARD, is_own
@@ -43,8 +43,7 @@ def _defaults(recipe: str, task: str, env_id: str) -> dict[str, Any] | None:
     A run that somebody sent may name any file, which is not to be run.
     """
     from giril_rl.config.compose import resolved
-    from giril_rl.config.recipe_config import config_class
-    from giril_rl.config.recipe_files import shipped
+    from giril_rl.config.recipes import config_class, shipped
 
     try:
         found = {each.name: each for each in shipped()}[recipe]
@@ -57,7 +56,7 @@ def _defaults(recipe: str, task: str, env_id: str) -> dict[str, Any] | None:
 @cache
 def _task_word(task: str, env_id: str) -> str:
     from giril_rl.config.compose import groups
-    from giril_rl.config.recipe_files import find
+    from giril_rl.config.recipes import find
 
     known = task in groups(find("control"))["task"][0]
     return f"task={task}" if known else f"task.env_id={env_id}"

@@ -10,41 +10,17 @@ from collections.abc import Iterator, Sequence
 from itertools import islice
 from pathlib import Path
 from types import FrameType
-from typing import Protocol
 
 from filelock import FileLock, Timeout
 
 from giril_rl.errors import INTERRUPTED
-from giril_rl.experiments.study.config import StudyConfig
-from giril_rl.experiments.study.logs import last_line
+from giril_rl.experiments.study.launchers import Launcher
 from giril_rl.experiments.study.plan import StudyRun
-from giril_rl.experiments.study.status import StudyFolder
+from giril_rl.experiments.study.spec import StudyConfig
+from giril_rl.experiments.study.status import StudyFolder, last_line
 from giril_rl.runs.progress import progress
 
 PAUSE = 0.1  # seconds between looks at the runs
-
-
-class Launcher(Protocol):
-    """Where runs are made: processes of this machine, or a cluster."""
-
-    @property
-    def slots(self) -> int:
-        """How many runs it has room for."""
-
-    def start(self, run: StudyRun, log: Path) -> None:
-        """Start a run; what it prints is added to ``log``."""
-
-    def poll(self) -> list[tuple[StudyRun, int]]:
-        """Runs that have ended since the last call, with their exit codes."""
-
-    def interrupt(self) -> None:
-        """Ask all runs to save their state and stop."""
-
-    def kill(self) -> None:
-        """Stop all runs at once."""
-
-    def close(self) -> None:
-        """Leave nothing running."""
 
 
 class Signals:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
@@ -16,6 +17,9 @@ from giril_rl.files.disk import csv_text, write_atomically, write_json
 from giril_rl.files.untrusted import parse_json, read_text
 from giril_rl.runs.naming import config_hash, safe
 
+MOST_BYTES = 2**20
+"""The size of a log beyond which a new one is begun; a study may be started any number of times."""
+_TAIL = 2**16
 State = Literal["waiting", "running", "finished", "failed", "interrupted"]
 
 
@@ -141,3 +145,37 @@ class StudyFolder:
 class _Plain(yaml.SafeDumper):
     def ignore_aliases(self, data: object) -> bool:
         return True
+
+
+def begin_log(log: Path, command: list[str]) -> None:
+    r"""Adds to a log what is about to be run; one that is too long is put aside, ``NAME.log.old``.
+
+    Args:
+        log: the file; its folder is made if need be.
+        command: the words after ``giril``.
+
+    Examples:
+        >>> import tempfile
+        >>> log = Path(tempfile.mkdtemp()) / "a.log"
+        >>> _ = log.write_text("x" * (MOST_BYTES + 1))
+        >>> begin_log(log, ["run", "bc"])
+        >>> log.read_text(), sorted(path.name for path in log.parent.iterdir())
+        ('\n$ giril run bc\n', ['a.log', 'a.log.old'])
+    """
+    log.parent.mkdir(parents=True, exist_ok=True)
+    if log.is_file() and log.stat().st_size > MOST_BYTES:
+        os.replace(log, log.with_name(f"{log.name}.old"))
+    with open(log, "ab") as output:
+        output.write(f"\n$ giril {' '.join(command)}\n".encode())
+
+
+def last_line(log: Path) -> str:
+    """The last line of a log that holds anything, empty where there is none."""
+    try:
+        with open(log, "rb") as file:
+            file.seek(max(os.fstat(file.fileno()).st_size - _TAIL, 0))
+            text = file.read().decode("utf-8", errors="replace")
+    except OSError:
+        return ""
+    lines = [line.strip() for line in text.splitlines() if line.strip()]
+    return lines[-1] if lines else ""
