@@ -93,8 +93,8 @@ def test_profile_horizon_and_termination_change_nothing_and_the_seed_does(root, 
             "bc.stop=held_out needs transitions to hold out and demo.subsample=1 leaves none: set "
             "demo.subsample to at least 2, or bc.stop=fixed.",
         ),
-        (["bc.stop=x"], "bc.stop=x: choose one of held_out, fixed."),
-        (["bc.min_std=0"], "bc.min_std=0.0 must be above 0."),
+        (["bc.stop=x"], "bc.stop=x must be 'held_out' or 'fixed'."),
+        (["bc.min_std=0"], "bc.min_std=0.0 must be greater than 0."),
     ],
 )
 def test_refusals(words, sentence):

@@ -132,8 +132,8 @@ def _run_import(args: Namespace) -> None:
     _check_new(args.out)
     check_number("--episodes", args.episodes, least=1)
     _import_modules(args)
+    from giril_rl.config.tasks import named_task
     from giril_rl.demos.importing import import_demonstration
-    from giril_rl.demos.task import named_task
 
     task = named_task(args.task, args.env_id)
     found = import_demonstration(args.source, task, episodes=args.episodes, name=args.name)
@@ -153,7 +153,8 @@ def _run_export(args: Namespace) -> None:
         print(f"{args.npz} has {len(found):,} transitions, {found.num_episodes:,} episodes.")
         return
     _import_modules(args)
-    from giril_rl.demos.task import as_recorded_task, named_task
+    from giril_rl.config.tasks import named_task
+    from giril_rl.demos.task import as_recorded_task
     from giril_rl.envs import gym_factory
 
     env_id = args.env_id
@@ -175,8 +176,9 @@ def _run_play(args: Namespace) -> None:
     check_number("--episodes", args.episodes, least=1)
     check_number("--seed", args.seed, least=0)
     _import_modules(args)
+    from giril_rl.config.tasks import named_task
     from giril_rl.demos.play import Window, play_demonstration
-    from giril_rl.demos.task import as_recorded_task, named_task
+    from giril_rl.demos.task import as_recorded_task
     from giril_rl.envs import gym_factory
 
     task = as_recorded_task(named_task(args.task, args.env_id), args.lives)
@@ -196,9 +198,11 @@ def _run_play(args: Namespace) -> None:
 
 
 def _found_folder(path: Path) -> Path:
-    from giril_rl.demos.shipped import demonstration_folder
+    folder = path
+    if str(path).partition(":")[0] == "shipped":
+        from giril_rl.demos.shipped import demonstration_folder
 
-    folder = demonstration_folder(path)
+        folder = demonstration_folder(path)
     if not (folder / "card.json").is_file():
         raise UserError(
             f"{path} is not the folder of a demonstration: recipes keep theirs in "

@@ -159,13 +159,14 @@ class Knob:
         """The type with the knob's bounds, as pydantic reads them."""
         from pydantic import Field
 
-        bounds = dict(self.metadata.get("bounds") or {})
+        whole: dict[str, Any] = {"ge": -MOST, "le": MOST}
+        bounds: dict[str, Any] = self.metadata.get("bounds") or {}
         if self.metadata.get("choices"):
             return Literal[self.metadata["choices"]]
         if self.is_list and kind is self._kind:
             return list[self._bounded(get_args(kind)[0])]  # type: ignore[misc]
         if kind is int:
-            return Annotated[int, Field(**{"ge": -MOST, "le": MOST} | bounds)]
+            return Annotated[int, Field(**(whole | bounds))]
         if kind is float:
             return Annotated[float, Field(allow_inf_nan=False, **bounds)]
         return kind

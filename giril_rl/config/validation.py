@@ -166,14 +166,15 @@ def validate(config: Any) -> None:
         ...
         giril_rl.errors.UserError: lr=0.0 must be greater than 0.
     """
-    for knob in _knobs(type(config)):
+    kind: Any = type(config)
+    for knob in _knobs(kind):
         knob.check(attrgetter(knob.key)(config))
     _check_parts(config)
     _check_run(config)
 
 
 @cache
-def _knobs(config: type[Any]) -> tuple[Knob, ...]:
+def _knobs(config: Any) -> tuple[Knob, ...]:
     return tuple(knobs(config))
 
 

@@ -232,15 +232,15 @@ def test_a_run_that_died_ends_as_an_undisturbed_one(words, root, tmp_path, monke
     [
         (
             ["control", "reward=bogus"],
-            "reward=bogus: choose one of constant, untrained_giril, untrained_icm, copy, noise, "
-            "negated_giril, centred_giril, random, held_action.",
+            "reward=bogus must be 'constant', 'untrained_giril', 'untrained_icm', 'copy', 'noise', "
+            "'negated_giril', 'centred_giril', 'random' or 'held_action'.",
         ),
-        (["control", "giril.beta=0"], "giril.beta=0.0 must be in (0, 1]."),
+        (["control", "giril.beta=0"], "giril.beta=0.0 must be greater than 0."),
         (
             ["cdil", "reward.features=all"],
-            "reward.features=all: choose one of inverse, both, none.",
+            "reward.features=all must be 'inverse', 'both' or 'none'.",
         ),
-        (["cdil", "reward.scale=0"], "reward.scale=0.0 must be above 0."),
+        (["cdil", "reward.scale=0"], "reward.scale=0.0 must be greater than 0."),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )

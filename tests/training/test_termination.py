@@ -82,7 +82,7 @@ def test_the_batch_keeps_its_flags():
 
 def test_other_words_are_refused():
     agent, _ = two_steps(failed=True, done=True)
-    with pytest.raises(UserError, match=r"^termination=never: choose one of ends, bootstrap\.$"):
+    with pytest.raises(UserError, match=r"^termination=never must be 'ends' or 'bootstrap'\.$"):
         PPOLearner(agent, PPOConfig(), total_steps=1, termination="never")
 
 

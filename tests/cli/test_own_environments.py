@@ -56,13 +56,7 @@ def own(tmp_path, monkeypatch):
     forget()
 
 
-def refused(capsys, *words):
-    capsys.readouterr()
-    assert main(words) == 2
-    return capsys.readouterr().err.splitlines()[-1].removeprefix("giril: ")
-
-
-def test_a_run_on_it_is_made_and_scored(own, capsys):
+def test_a_run_on_it_is_made_and_scored(own, refused):
     words = ["run", "control", "task.env_id=own_envs:Own-v0", *TINY]
     assert main(words) == 0
     run = "runs/control/own_envs-Own-v0/"
@@ -71,7 +65,7 @@ def test_a_run_on_it_is_made_and_scored(own, capsys):
     folder = str(result.parent)
     assert main(["eval", folder]) == 0  # The module is imported already.
     own()
-    assert refused(capsys, "eval", folder) == (
+    assert refused("eval", folder) == (
         f"{folder} names the module own_envs, and reading a run imports nothing: if you trust it, "
         "add --import own_envs."
     )
@@ -116,13 +110,13 @@ def test_its_demonstrations_are_imported(own, words):
         ("", "task.env_id=own_envs:Own-v0 is not a Gymnasium id that own_envs registers: check it"),
     ],
 )
-def test_a_module_that_cannot_be_used_is_named(own, text, sentence, tmp_path, capsys, monkeypatch):
+def test_a_module_that_cannot_be_used_is_named(own, text, sentence, tmp_path, monkeypatch, refused):
     monkeypatch.setattr("gymnasium.registry", {})  # Other tests may have added what is near.
     Path("own_envs.py").unlink()
     shutil.rmtree("__pycache__", ignore_errors=True)
     if text is not None:
         Path("own_envs.py").write_text(text)
-    found = refused(capsys, "run", "control", "task.env_id=own_envs:Own-v0", *TINY)
+    found = refused("run", "control", "task.env_id=own_envs:Own-v0", *TINY)
     assert found.startswith(sentence.replace("HERE", str(tmp_path)))
     assert not Path("runs").exists()
 
@@ -134,11 +128,11 @@ def test_an_installed_package_goes_before_a_file_of_its_name(own, tmp_path):
     assert Path(sys.modules["wave"].__file__).parent != tmp_path
 
 
-def test_a_study_names_modules_on_its_command_line(own, capsys):
+def test_a_study_names_modules_on_its_command_line(own, refused):
     Path("mine.yaml").write_text(
         "groups: [{label: a, recipe: control, task.env_id: 'own_envs:Own-v0'}]"
     )
-    assert refused(capsys, "study", "mine.yaml", "--dry-run") == (
+    assert refused("study", "mine.yaml", "--dry-run") == (
         "mine names the module own_envs, and a study's file alone imports nothing: if you trust "
         "it, add imports=[own_envs] to the command."
     )
@@ -147,5 +141,5 @@ def test_a_study_names_modules_on_its_command_line(own, capsys):
     assert (config.imports, config.task.env_id) == (["own_envs"], "own_envs:Own-v0")
     assert "own_envs" not in sys.modules  # Its run imports it, in a process of its own.
     Path("own_envs.py").unlink()
-    sentence = refused(capsys, "study", "mine.yaml", "imports=[own_envs]", "--dry-run")
+    sentence = refused("study", "mine.yaml", "imports=[own_envs]", "--dry-run")
     assert sentence.startswith("there is no module own_envs among the installed packages or in ")
