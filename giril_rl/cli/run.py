@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 import sys
 import textwrap
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -46,6 +47,8 @@ def run(argv: Sequence[str], description: str | None, refuse: Callable[[Exceptio
             parser.print_help()
             return 0
         raise UserError("name a recipe: `giril ls` shows them.")
+    # A recipe that was copied from an earlier version may use names that are about to go.
+    warnings.filterwarnings("default", r"giril_rl\.", DeprecationWarning)
     recipe, texts = find(args.words[0]), args.words[1:]
     schema = config_class(recipe)
     if args.help:

@@ -1,5 +1,6 @@
 """The loops that recipes share: fit a reward, PPO on a reward, score, keep and resume."""
 
+from giril_rl.moved import forwarding
 from giril_rl.policies.agent import load_agent, make_agent
 from giril_rl.runs.run import Run
 from giril_rl.training.adversarial import AdversarialLearner
@@ -39,3 +40,5 @@ __all__ = [
     "train_expert",
     "train_ppo",
 ]
+
+__getattr__ = forwarding(__name__)  # Names of version 0.1.
