@@ -90,7 +90,10 @@ class MovedModules(MetaPathFinder, Loader):
     def exec_module(self, module: ModuleType) -> None:
         """Lets the module find all names in its new place."""
         old = module.__name__
-        _warn(old, f"giril_rl.{MOVED[old.partition('.')[2]]}")
+        new = f"giril_rl.{MOVED[old.partition('.')[2]]}"
+        _warn(old, new)
+        # At once: who looks through all modules for an attribute must not start an import.
+        importlib.import_module(new)
         module.__getattr__ = forwarding(old)  # type: ignore[method-assign]
 
 
