@@ -1,4 +1,4 @@
-"""The subcommand ``giril demo``."""
+"""``giril demo``: show, import, export or play a demonstration."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from giril_rl.cli.parser import Parser, check_number
 from giril_rl.errors import UserError
 
 FASTEST = 50
-"""Frames a second: a GIF counts in hundredths of a second, and viewers slow down a single one."""
+"""Frames per second: a GIF counts in hundredths of a second, and viewers slow down a single one."""
 
 
 def demo(argv: Sequence[str], description: str | None = None) -> int:
-    """Shows, imports, exports or plays a demonstration.
+    """Does what the words after ``giril demo`` ask for.
 
     Args:
-        argv: the words after ``giril demo``.
+        argv: the words.
         description: of the command, for its help.
 
     Raises:
-        UserError: for a demonstration or data set that is missing or not sound; nothing is written
-            then.
+        UserError: for a demonstration or data set that is missing or damaged; then nothing is
+            written.
     """
     parser = Parser("giril demo", description=description)
     kinds = parser.add_subparsers(metavar="show|import|export|play", required=True)
@@ -57,7 +57,7 @@ def _add_task(parser: Parser) -> None:
 
 
 def _import_modules(args: Namespace) -> None:
-    """Those that the command line names; what a demonstration's card names is not imported."""
+    """Imports the modules that the command line names, not those of a demonstration's card."""
     from giril_rl.config.imports import import_modules, named_modules
 
     import_modules([*args.imports, *named_modules(args.env_id)], Path.cwd())
@@ -212,7 +212,7 @@ def _found_folder(path: Path) -> Path:
 
 
 def _check_new(out: Path) -> None:
-    """Before any work, what saving would refuse after it."""
+    """Refuses before the work what saving would refuse after it."""
     if out.is_file() or (out.is_dir() and any(out.iterdir())):
         raise UserError(f"{out} is there already: choose another folder, or delete it.")
 

@@ -1,7 +1,8 @@
 """The settings of every recipe, one dataclass for each part.
 
 Hydra enforces a field's type; :func:`giril_rl.config.validation.validate` checks its bounds and
-choices; ``giril run RECIPE --help`` shows its line of help. Nothing heavy is imported here.
+choices and calls ``check`` of a class that has it; ``giril run RECIPE --help`` shows its line of
+help. Nothing heavy is imported here.
 """
 
 from __future__ import annotations
@@ -10,7 +11,8 @@ from dataclasses import dataclass, field
 
 from omegaconf import MISSING
 
-from giril_rl.config.knobs import knob
+from giril_rl.config.knobs import default_text, knob
+from giril_rl.errors import UserError
 
 MOST_THREADS = 1024
 COMPILE = "torch.compile of gradient steps: for long training on frames, 20 seconds to begin"
@@ -79,6 +81,23 @@ class TaskConfig:
         """Whether the environment is one of the Arcade Learning Environment."""
         return is_atari(self.env_id)
 
+    def check(self, prefix: str, run: object) -> None:
+        """Refuses settings of another kind of task; see :func:`.validation.validate`."""
+        if self.is_atari and self.horizon != "own":
+            raise UserError(
+                f"{prefix}horizon={self.horizon} is for vector tasks: leave {prefix}horizon=own."
+            )
+        if self.episode != "life" and not self.is_atari:
+            raise UserError(
+                f"{prefix}episode={self.episode} is for games, whose lives end episodes: leave "
+                f"{prefix}episode=life."
+            )
+        if self.after_failure != "reset" and self.horizon == "own":
+            raise UserError(
+                f"{prefix}after_failure={self.after_failure} means nothing where a failure ends "
+                f"the episode: add {prefix}horizon=fixed."
+            )
+
 
 @dataclass
 class PPOConfig:
@@ -113,6 +132,16 @@ class PPOConfig:
         """
         batch = self.num_envs * self.rollout
         return -(-steps // batch) * batch
+
+    def check(self, prefix: str, run: object) -> None:
+        """Refuses a minibatch that does not divide the batch."""
+        batch = self.num_envs * self.rollout
+        if batch % self.minibatch:
+            raise UserError(
+                f"{prefix}minibatch={self.minibatch} does not divide {prefix}num_envs * "
+                f"{prefix}rollout = {self.num_envs} * {self.rollout} = {batch}: choose one that "
+                "does."
+            )
 
 
 @dataclass
@@ -152,6 +181,20 @@ class DemoConfig:
     deterministic: bool = knob(True, "play the expert's mean action rather than a sampled one")
     seed: int | None = knob(None, "seed of the recorded episodes; null takes the run's seed", low=0)
     subsample: int = knob(20, "keep 1 in k transitions, fixed once (paper: 20; 1 keeps all)", low=1)
+
+    def check(self, prefix: str, run: object) -> None:
+        """Refuses two lengths, none, or a subsample of nothing."""
+        length, episodes = default_text(self.length), default_text(self.episodes)
+        if (self.length is None) == (self.episodes is None):
+            raise UserError(
+                f"{prefix}length={length} and {prefix}episodes={episodes}: give exactly one of "
+                "them and set the other to null."
+            )
+        if self.length is not None and self.subsample > self.length:
+            raise UserError(
+                f"{prefix}subsample={self.subsample} leaves nothing of {prefix}length={length}: "
+                "choose a smaller one."
+            )
 
 
 @dataclass

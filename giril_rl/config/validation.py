@@ -1,8 +1,7 @@
-"""Semantic checks of config values, before anything is trained."""
+"""Checks of config values, before anything is trained."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import fields, is_dataclass
 from functools import cache
 from operator import attrgetter
@@ -17,36 +16,84 @@ from giril_rl.config.schema import (
     ExpertRunConfig,
     PPOConfig,
     RunConfig,
-    TaskConfig,
 )
 from giril_rl.config.tasks import apply_task_defaults
 from giril_rl.errors import UserError
 
 
-def _check_ppo(key: str, ppo: PPOConfig) -> None:
-    batch = ppo.num_envs * ppo.rollout
-    if batch % ppo.minibatch:
-        raise UserError(
-            f"{key}.minibatch={ppo.minibatch} does not divide {key}.num_envs * {key}.rollout "
-            f"= {ppo.num_envs} * {ppo.rollout} = {batch}: choose one that does."
-        )
+def validate(config: Any) -> None:
+    """Check every knob's type, bounds and choices, then how they fit together.
+
+    Numbers must be finite; the entries of a list are checked one by one; null passes where the type
+    has it. A dataclass may have checks of its own, ``check(prefix, run)``: ``prefix`` is its dotted
+    key with the dot, ``run`` the whole configuration.
+
+    Args:
+        config: an instance of a recipe's ``Config`` or of any part of one.
+
+    Raises:
+        UserError: names the first key whose value is refused.
+
+    Examples:
+        >>> validate(PPOConfig(lr=0.0))
+        Traceback (most recent call last):
+        ...
+        giril_rl.errors.UserError: lr=0.0 must be greater than 0.
+    """
+    kind: Any = type(config)
+    for knob in _knobs(kind):
+        knob.check(attrgetter(knob.key)(config))
+    _check_parts(config, "", config)
+    if isinstance(config, RunConfig):
+        _check_run(config)
 
 
-def _check_task(key: str, task: TaskConfig) -> None:
-    if task.is_atari and task.horizon != "own":
+@cache
+def _knobs(config: Any) -> tuple[Knob, ...]:
+    return tuple(knobs(config))
+
+
+def _check_parts(part: Any, prefix: str, run: Any) -> None:
+    if callable(getattr(part, "check", None)):
+        part.check(prefix, run)
+    for field in fields(part):
+        value = getattr(part, field.name)
+        if is_dataclass(value):
+            _check_parts(value, f"{prefix}{field.name}.", run)
+
+
+def _check_run(config: RunConfig) -> None:
+    check_names(config.imports)
+    for field in fields(config):
+        _check_observations(field.name, getattr(config, field.name), config)
+    if config.task.is_atari and config.ppo.normalise_observations:
         raise UserError(
-            f"{key}.horizon={task.horizon} is for vector tasks: leave {key}.horizon=own."
+            f"ppo.normalise_observations=true is for vectors, and {config.task.name} has frames, "
+            "which are divided by 255: leave it out."
         )
-    if task.episode != "life" and not task.is_atari:
+    if isinstance(config, ExpertRunConfig):
+        _check_expert_run(config)
+    cloning = getattr(config, "bc", None)
+    if isinstance(cloning, BCConfig):
+        _check_cloning(config, cloning)
+
+
+def _check_observations(name: str, part: Any, config: RunConfig) -> None:
+    """Refuses a part's settings for vectors where the task has frames, and the reverse."""
+    task = config.task
+    rule = getattr(part, "normalise", None)
+    if rule is not None and (rule == "pixels") != task.is_atari:
+        right = "pixels" if task.is_atari else "standardise"
         raise UserError(
-            f"{key}.episode={task.episode} is for games, whose lives end episodes: leave "
-            f"{key}.episode=life."
+            f"{name}.normalise={rule} does not fit the observations of {task.name}: set "
+            f"{name}.normalise={right}."
         )
-    if task.after_failure != "reset" and task.horizon == "own":
-        raise UserError(
-            f"{key}.after_failure={task.after_failure} means nothing where a failure ends the "
-            f"episode: add {key}.horizon=fixed."
-        )
+    for layers in ("hidden", "model_hidden") if task.is_atari else ():
+        if hasattr(part, layers) and getattr(part, layers) != getattr(type(part)(), layers):
+            raise UserError(
+                f"{name}.{layers}={default_text(getattr(part, layers))} is for vectors, and "
+                f"{task.name} has frames, whose layers are fixed: leave it out."
+            )
 
 
 def _check_expert_run(config: ExpertRunConfig) -> None:
@@ -73,119 +120,11 @@ def _check_cloning(config: Any, cloning: BCConfig) -> None:
         )
 
 
-def _check_normalise(config: Any) -> None:
-    """Frames have one rule of normalisation, and it is for nothing else."""
-    for part in fields(config):
-        rule = getattr(getattr(config, part.name), "normalise", None)
-        if rule is not None and (rule == "pixels") != config.task.is_atari:
-            right = "pixels" if config.task.is_atari else "standardise"
-            raise UserError(
-                f"{part.name}.normalise={rule} does not fit the observations of "
-                f"{config.task.name}: set {part.name}.normalise={right}."
-            )
-    if config.task.is_atari and config.ppo.normalise_observations:
-        raise UserError(
-            f"ppo.normalise_observations=true is for vectors, and {config.task.name} has frames, "
-            "which are divided by 255: leave it out."
-        )
-
-
-def _check_layers(config: RunConfig) -> None:
-    """The networks of frames are the paper's: what would change those of vectors has no effect."""
-    for part in fields(config):
-        value = getattr(config, part.name)
-        for name in ("hidden", "model_hidden"):
-            if hasattr(value, name) and getattr(value, name) != getattr(type(value)(), name):
-                raise UserError(
-                    f"{part.name}.{name}={default_text(getattr(value, name))} is for vectors, and "
-                    f"{config.task.name} has frames, whose layers are fixed: leave it out."
-                )
-
-
-def _check_run(config: Any) -> None:
-    if isinstance(config, RunConfig):
-        check_names(config.imports)
-        _check_normalise(config)
-        if config.task.is_atari:
-            _check_layers(config)
-    if isinstance(config, ExpertRunConfig):
-        _check_expert_run(config)
-    cloning = getattr(config, "bc", None)
-    if isinstance(cloning, BCConfig):
-        _check_cloning(config, cloning)
-
-
-def _check_demo(key: str, demo: DemoConfig) -> None:
-    length, episodes = default_text(demo.length), default_text(demo.episodes)
-    if (demo.length is None) == (demo.episodes is None):
-        raise UserError(
-            f"{key}.length={length} and {key}.episodes={episodes}: give exactly one of them and "
-            "set the other to null."
-        )
-    if demo.length is not None and demo.subsample > demo.length:
-        raise UserError(
-            f"{key}.subsample={demo.subsample} leaves nothing of {key}.length={demo.length}: "
-            "choose a smaller one."
-        )
-
-
-_PART_CHECKS: dict[type, Callable[[str, Any], None]] = {
-    PPOConfig: _check_ppo,
-    TaskConfig: _check_task,
-    DemoConfig: _check_demo,
-}
-
-
-def _check_parts(config: Any, prefix: str = "") -> None:
-    for part in fields(config):
-        value = getattr(config, part.name)
-        if is_dataclass(value):
-            key = f"{prefix}{part.name}"
-            for kind, check in _PART_CHECKS.items():
-                if isinstance(value, kind):
-                    check(key, value)
-            _check_parts(value, f"{key}.")
-
-
-def validate(config: Any) -> None:
-    """Check every knob's type, bounds and choices, then what single knobs cannot tell.
-
-    Numbers must be finite; a list's entries are checked one by one; null passes where the type
-    has it.
-
-    Args:
-        config: an instance of a recipe's ``Config`` or of any part of one.
-
-    Raises:
-        UserError: names the first key whose value is refused.
-
-    Examples:
-        >>> from giril_rl.config.schema import PPOConfig
-        >>> validate(PPOConfig(lr=0.0))
-        Traceback (most recent call last):
-        ...
-        giril_rl.errors.UserError: lr=0.0 must be greater than 0.
-    """
-    kind: Any = type(config)
-    for knob in _knobs(kind):
-        knob.check(attrgetter(knob.key)(config))
-    _check_parts(config)
-    _check_run(config)
-
-
-@cache
-def _knobs(config: Any) -> tuple[Knob, ...]:
-    return tuple(knobs(config))
-
-
 def notices(config: Any) -> list[str]:
-    """What a user should know of settings that are taken in another way than they are written.
+    """Sentences about settings that are rounded.
 
     Args:
         config: an instance of a recipe's ``Config``.
-
-    Returns:
-        Sentences.
 
     Examples:
         >>> from giril_rl.config.schema import TaskConfig
@@ -195,15 +134,15 @@ def notices(config: Any) -> list[str]:
     """
     found = []
     trains = getattr(config, "reward", None) not in ("random", "held_action")
-    if isinstance(config, RunConfig) and trains:  # Of cloning, steps are 0.
+    if isinstance(config, RunConfig) and trains:  # Cloning has 0 steps.
         found += _rounding("steps", config.steps, config.ppo)
     expert, demo = getattr(config, "expert", None), getattr(config, "demo", None)
     recorded = not isinstance(demo, DemoConfig) or demo.path is None
     needed = getattr(config, "needs_demonstration", True)
     if isinstance(expert, ExpertConfig) and expert.path is None and recorded and needed:
-        # The expert that another recipe trains has the settings of PPO that are the default.
         key = "task.expert_steps" if expert.steps is None else "expert.steps"
-        ppo = apply_task_defaults(ExpertRunConfig(task=config.task)).ppo
+        # Whatever this recipe's own settings of PPO are, the expert's are the defaults.
+        ppo = apply_task_defaults(RunConfig(task=config.task)).ppo
         found += _rounding(key, expert.steps_on(config.task), ppo)
     return found
 

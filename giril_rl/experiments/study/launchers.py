@@ -17,15 +17,15 @@ from giril_rl.experiments.study.status import begin_log
 from giril_rl.runs.interrupt import gentle_signal
 
 KILLED = -9
-"""The code of a run whose worker is gone: that of SIGKILL, which Windows does not name."""
+"""The exit code of a run whose worker is gone: that of SIGKILL, which Windows does not name."""
 
 
 class Launcher(Protocol):
-    """Where runs are made: processes of this machine, or a cluster."""
+    """Makes runs, in processes of this machine or on a cluster."""
 
     @property
     def slots(self) -> int:
-        """How many runs it has room for."""
+        """The number of runs that it has room for."""
 
     def start(self, run: StudyRun, log: Path) -> None:
         """Start a run; what it prints is added to ``log``."""
@@ -44,7 +44,7 @@ class Launcher(Protocol):
 
 
 def visible_gpus() -> list[str]:
-    """The GPUs that torch sees, as ``CUDA_VISIBLE_DEVICES`` names them for a process below.
+    """The GPUs that torch sees, named as in ``CUDA_VISIBLE_DEVICES``.
 
     Examples:
         >>> all(isinstance(gpu, str) for gpu in visible_gpus())
@@ -61,14 +61,14 @@ def visible_gpus() -> list[str]:
 class LocalLauncher:
     """Starts each run as a process of its own, its output in a log file.
 
-    A process is the leader of its own group, so that Ctrl-C in the terminal reaches it only through
-    :meth:`interrupt`. Should this process be killed, the system closes the standard input of each.
+    Each process leads a group of its own, so that Ctrl-C in the terminal reaches it only through
+    :meth:`interrupt`. If this process is killed, the system closes the standard input of each.
 
     Args:
-        program: what a process runs, with a run's words after it. It is to stop by itself once its
-            standard input is closed.
-        gpus: names of the GPUs for runs with ``device=cuda``, as ``CUDA_VISIBLE_DEVICES`` has them;
-            each run sees the one that the fewest others use.
+        program: the command of a process, to which a run's words are added. It must stop by itself
+            once its standard input is closed.
+        gpus: the GPUs for runs with ``device=cuda``, named as in ``CUDA_VISIBLE_DEVICES``; each run
+            sees the one that the fewest others use.
         per_gpu: how many runs share a GPU.
     """
 
@@ -83,7 +83,7 @@ class LocalLauncher:
 
     @property
     def slots(self) -> int:
-        """How many runs this machine has cores for, and room on its GPUs where runs use them."""
+        """The number of cores, or of places on the GPUs if that is smaller."""
         cores = (
             len(os.sched_getaffinity(0))
             if hasattr(os, "sched_getaffinity")
@@ -136,7 +136,7 @@ class LocalLauncher:
             process.kill()
 
     def close(self) -> None:
-        """Nothing is left running."""
+        """Kill what still runs."""
         self.kill()
         for _, process in self._running.values():
             process.wait()
@@ -151,12 +151,12 @@ class LocalLauncher:
 class RayLauncher:
     """Hands each run to a Ray worker that does nothing else, its output in a log file.
 
-    The run takes place in the worker itself rather than in a process below it: when a worker is
-    killed, nothing stays behind that holds the run's folder.
+    The run takes place in the worker itself, not in a process below it: when a worker is killed,
+    nothing is left that holds the run's folder. The machines must share the run's folders.
 
     Args:
-        command_line: what makes a run of its words and returns the exit code.
-        address: the cluster's address, ``auto`` for one that runs on this machine.
+        command_line: makes a run of its words and returns the exit code.
+        address: the cluster's address; ``auto`` for one on this machine.
         per_gpu: how many runs share a GPU; None where no run uses one.
 
     Raises:
@@ -198,7 +198,7 @@ class RayLauncher:
 
     @property
     def slots(self) -> int:
-        """How many CPUs the cluster has at the moment, or places on its GPUs where runs use one."""
+        """The number of CPUs of the cluster, or of places on its GPUs if that is smaller."""
         cpus = int(self._resource("CPU"))
         if self._per_gpu is not None:
             cpus = min(cpus, int(self._resource("GPU")) * self._per_gpu)
@@ -244,7 +244,7 @@ class RayLauncher:
         self._cancel(force=True)
 
     def close(self) -> None:
-        """Leave the cluster, which ends what still runs there."""
+        """Leave the cluster, which ends the runs there."""
         self._ray.shutdown()
 
     def _cancel(self, *, force: bool) -> None:
@@ -260,7 +260,7 @@ def run_in_worker(
     """Make a run inside a Ray worker, as ``giril`` would, and return the exit code.
 
     Args:
-        command_line: what makes it, given the words.
+        command_line: makes the run of its words.
         command: the words after ``giril``.
         log: the file that the output is added to.
         folder: the working directory.

@@ -1,4 +1,4 @@
-"""From a study's file to the list of its runs, each composed and checked before any is started."""
+"""The runs of a study, all composed and checked before the first one starts."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ _STUDYS_OWN = ("out", "root")
 
 @dataclass(frozen=True)
 class StudyRun:
-    """One run of a study: what ``giril run`` is called with and where it leaves its folder.
+    """One run of a study: the words for ``giril run``, and the folder of the run.
 
     Attributes:
         label: its group's label.
         recipe: the recipe.
-        words: its ``key=value`` texts, without those that change nothing.
+        words: its ``key=value`` texts, less those that change nothing.
         config: the composed and validated configuration.
         folder: the run's folder.
         root: the folder that all runs of the study are in.
@@ -46,7 +46,7 @@ class StudyRun:
 
     @property
     def name(self) -> str:
-        """The run's folder as seen from the root, which tells it from all other runs."""
+        """The run's folder relative to the root, unique among the runs."""
         return self.folder.relative_to(self.root).as_posix()
 
     @property
@@ -57,7 +57,7 @@ class StudyRun:
 
     @property
     def finished(self) -> bool:
-        """Whether the run has its result, with the scores that are asked for."""
+        """Whether the run has a result, with the scores of the episodes that are asked for."""
         return self.has_result and is_scored_as(self.folder, self.config.eval)
 
     @property
@@ -67,7 +67,7 @@ class StudyRun:
 
     @property
     def goes_first(self) -> bool:
-        """Whether other runs may wait for this one: an expert, which they record or train on."""
+        """Whether other runs wait for this one, because it is an expert that they record."""
         return isinstance(self.config, ExpertRunConfig)
 
 
@@ -85,12 +85,12 @@ class Planner:
     def plan(self, spec: Spec, changes: Sequence[str] = ()) -> list[StudyRun]:
         """All runs of ``spec``, those of the lowest seed first.
 
-        A study that is cut short then has a few seeds of every row, not every seed of a few rows.
+        A study that is cut short then has a few seeds of every row instead of every seed of a few.
 
         Args:
             spec: the study.
-            changes: ``key=value`` texts that take the place of every group's own, where its recipe
-                has that knob; ``steps`` not of a ``player``, nor of cloning.
+            changes: ``key=value`` texts that replace every group's own, where its recipe has that
+                knob; ``steps`` is not for a ``player``, nor for cloning.
 
         Raises:
             UserError: in one sentence, naming the group, for an unknown recipe or key, a wrong type
@@ -203,7 +203,7 @@ def _twice(spec: Spec, one: StudyRun, other: StudyRun) -> str:
 
 
 def _check_finished(run: StudyRun) -> None:
-    """Refuses a run in the way that was made with other settings or by other code."""
+    """Refuses a folder whose run was made with other settings or by other code."""
     check_sources(run.folder, sources(run.recipe, modules_of(run.config)))
     if run.has_result:
         made = read_json(run.folder / "result.json").get("config_hash")

@@ -1,4 +1,4 @@
-"""A study's YAML, groups of runs with a list of values for a sweep; and a study's own settings."""
+"""A study's YAML file, groups of runs with lists of values, and the study's own settings."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _KEYS = ("title", "all", "groups")
 
 @dataclass
 class StudyConfig:
-    """What `giril study` takes itself; every other key is a knob of the study's runs."""
+    """The settings of `giril study` itself; every other key is a knob of the runs."""
 
     jobs: int | None = knob(
         None,
@@ -40,8 +40,8 @@ class Group:
         label: the group's name.
         recipes: names of recipes or paths of copied ones.
         knobs: ``{dotted key: value}``; see :func:`override_text` for lists.
-        player: whether its runs are the experts that the others record, which the command line's
-            ``steps=`` is not for.
+        player: whether its runs are the experts that the other groups record; the command line's
+            ``steps=`` is not for them.
     """
 
     label: str
@@ -52,12 +52,12 @@ class Group:
 
 @dataclass(frozen=True)
 class Spec:
-    """A study as it is written down.
+    """The content of a study's file.
 
     Attributes:
         name: the file's name without its suffix.
         title: one line about it.
-        groups: its groups, each with the knobs that all of them have.
+        groups: its groups, each with the knobs of ``all`` as well.
     """
 
     name: str
@@ -66,7 +66,7 @@ class Spec:
 
 
 def shipped_studies() -> dict[str, Path]:
-    """The studies that come with the package, by name.
+    """The shipped studies, by name.
 
     Examples:
         >>> "smoke" in shipped_studies()
@@ -101,7 +101,7 @@ def find_study(text: str) -> Path:
 
 
 def read_spec(path: Path) -> Spec:
-    """Read a study's file; its knobs are checked later, by their recipes.
+    """Read a study's file; its recipes check the knobs later.
 
     Raises:
         UserError: where the file is not valid YAML or not a study.
@@ -143,8 +143,8 @@ def _group(path: Path, number: int, entry: Any, shared: Mapping[str, Any]) -> Gr
 def override_text(key: str, value: Any, *, is_list: bool = False) -> str:
     """A knob of a study as ``key=value``, in the grammar of ``giril run -m``.
 
-    A list of values sweeps. For a knob that is itself a list, a list is one value and a list of
-    lists sweeps. Text is taken as it would be on the command line, or quoted where it could not be.
+    A list of values is a sweep. For a knob that is itself a list, a list is one value and a list of
+    lists a sweep. Text that the command line could not read is quoted.
 
     Args:
         key: the knob's dotted key.
@@ -182,5 +182,5 @@ def _readable(text: str, *, alone: bool) -> bool:
         (override,) = parse([text])
     except UserError:
         return False
-    # Beside other values, text that is itself a list of values would become more of them.
+    # Beside other values, text with commas would become several.
     return alone or not override.is_sweep_override()

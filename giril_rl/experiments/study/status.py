@@ -1,4 +1,4 @@
-"""What a study's folder keeps: the resolved study, and how each of its runs stands."""
+"""A study's folder: the resolved study, the state of each run, and what the runs print."""
 
 from __future__ import annotations
 
@@ -25,19 +25,19 @@ State = Literal["waiting", "running", "finished", "failed", "interrupted"]
 
 @dataclass
 class Standing:
-    """How one run stands; a row of ``status.csv`` and an entry of ``status.json``.
+    """The state of one run: a row of ``status.csv`` and an entry of ``status.json``.
 
     Attributes:
         label: the group's label.
         recipe: the recipe's name.
         task: the task's name.
         seed: the run's seed.
-        state: where it stands.
-        attempts: processes that were started for it by the latest command.
-        exit_code: of the last process; negative: the number of the signal that killed it.
-        seconds: how long the last process took.
-        folder: the run's folder, seen from the study's root.
-        log: the log file, seen from the study's folder.
+        state: of the run.
+        attempts: processes that the latest command started for it.
+        exit_code: of the last process; if negative, of the signal that killed it.
+        seconds: the duration of the last process.
+        folder: the run's folder, relative to the study's root.
+        log: the log file, relative to the study's folder.
         last_line: the log's last line, where the run failed.
     """
 
@@ -59,7 +59,7 @@ class StudyFolder:
 
     Args:
         spec: the study.
-        changes: what the command line changed; it is a part of the folder's name.
+        changes: what the command line changed, a part of the folder's name.
         runs: the study's runs.
     """
 
@@ -76,7 +76,7 @@ class StudyFolder:
         }
 
     def _before(self) -> dict[str, Standing]:
-        """The finished runs that the folder knows of, with what they took."""
+        """The finished runs that the folder knows of, with their durations."""
         try:
             rows = parse_json(read_text(self.path / "status.json"))["runs"]
             known = [Standing(**row) for row in rows]
@@ -100,15 +100,15 @@ class StudyFolder:
         )
 
     def log(self, run: StudyRun) -> Path:
-        """The file that the run's output goes to."""
+        """The file of the run's output."""
         return self.path / self.standings[run.name].log
 
     def count(self, state: State) -> int:
-        """How many runs are in that state."""
+        """The number of runs in that state."""
         return Counter(standing.state for standing in self.standings.values())[state]
 
     def write_study(self) -> None:
-        """Write ``study.yaml``: the study with what the command line changed, and its runs."""
+        """Write ``study.yaml``: the study, the command line's changes, and the runs."""
         content = {
             "name": self.spec.name,
             "title": self.spec.title,
@@ -148,7 +148,7 @@ class _Plain(yaml.SafeDumper):
 
 
 def begin_log(log: Path, command: list[str]) -> None:
-    r"""Adds to a log what is about to be run; one that is too long is put aside, ``NAME.log.old``.
+    r"""Adds a command to a log, and renames a log that is too long to ``NAME.log.old`` first.
 
     Args:
         log: the file; its folder is made if need be.
@@ -170,7 +170,7 @@ def begin_log(log: Path, command: list[str]) -> None:
 
 
 def last_line(log: Path) -> str:
-    """The last line of a log that holds anything, empty where there is none."""
+    """The last line of a log that is not blank, or an empty text."""
     try:
         with open(log, "rb") as file:
             file.seek(max(os.fstat(file.fileno()).st_size - _TAIL, 0))
