@@ -54,7 +54,7 @@ class TaskConfig:
     )
     steps: int = knob(1_000_000, "default policy steps for this task", low=1)
     demonstration: str | None = knob(
-        None, "what demo.path is where neither it nor an expert or a recording is asked for"
+        None, "default of demo.path, unless the demonstration, expert or recording is chosen"
     )
     expert_score: float | None = knob(None, "mean training return at which the expert stops early")
     expert_steps: int = knob(
@@ -62,7 +62,7 @@ class TaskConfig:
     )
     horizon: str = knob(
         "own",
-        "own: a failure ends an episode; fixed: only the time limit does (policy training only)",
+        "own: a failure ends an episode; fixed: only the time limit does (in policy training)",
         choices=("own", "fixed"),
     )
     after_failure: str = knob(
@@ -162,7 +162,7 @@ class ExpertConfig:
 
 @dataclass
 class DemoConfig:
-    """What is recorded from the expert and how much of it is used."""
+    """The demonstration: what is recorded from the expert, and how much of it is used."""
 
     path: str | None = knob(
         None,
@@ -340,7 +340,7 @@ class ScalingConfig:
 
 @dataclass
 class EvalConfig:
-    """Scoring on fresh environments, whole episodes, true reward."""
+    """Evaluation on fresh environments: whole episodes, true reward."""
 
     episodes: int = knob(20, "episodes for each of the deterministic and the sampled policy", low=1)
     seed: int = knob(10_000, "seed of the evaluation episodes", low=0)
@@ -348,7 +348,7 @@ class EvalConfig:
 
 @dataclass
 class RunConfig:
-    """What all recipes share."""
+    """Settings of every recipe."""
 
     task: TaskConfig = field(default_factory=TaskConfig)
     profile: str = knob(
@@ -383,7 +383,7 @@ class RunConfig:
     )
     termination: str = knob(
         "ends",
-        "ends: nothing comes after a failure; bootstrap: its value continues as after a time limit",
+        "ends: nothing follows a failure; bootstrap: its value continues, as after a time limit",
         choices=("ends", "bootstrap"),
     )
     ppo: PPOConfig = field(default_factory=PPOConfig)
@@ -392,7 +392,7 @@ class RunConfig:
 
 @dataclass
 class UnaveragedRunConfig(RunConfig):
-    """What recipes share that never average a reward: both profiles give the same run."""
+    """Settings of recipes that never average a reward: both profiles give the same run."""
 
     profile: str = knob(
         "released",
