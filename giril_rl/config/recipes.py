@@ -1,9 +1,10 @@
 """Recipes as files: the shipped ones, copies of them, and how one is loaded.
 
 A recipe is a Python file with a docstring, a dataclass ``Config`` (of
-:class:`giril_rl.config.schema.RunConfig`) and ``main(cfg: Config, out: Path) -> None``. Its
-settings are a YAML file: ``conf/NAME.yaml`` for a shipped recipe, the same name with the suffix
-``.yaml`` beside a copied one. Importing this module imports neither torch nor Hydra.
+:class:`giril_rl.config.schema.RunConfig`) and ``main(cfg: Config, out: Path) -> None``. A copied
+recipe has its settings beside it, in a YAML file of the same name. A shipped one has them in
+``conf/NAME.yaml``, or shares ``conf/recipe.yaml``. Importing this module imports neither torch nor
+Hydra.
 """
 
 from __future__ import annotations
@@ -12,15 +13,21 @@ import ast
 import importlib.util
 import shutil
 import sys
+from collections.abc import Iterator
 from dataclasses import dataclass, is_dataclass
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import yaml
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
 from giril_rl.config.imports import missing, search_in
 from giril_rl.config.nearest import did_you_mean
 from giril_rl.config.schema import RunConfig
 from giril_rl.errors import UserError
+from giril_rl.files.untrusted import check_yaml, read_text
 
 
 def shipped_folder() -> Path:
@@ -31,7 +38,7 @@ def shipped_folder() -> Path:
 
 
 def shipped_conf() -> Path:
-    """The folder of the shipped recipes' YAML and of its groups ``task`` and ``profile``."""
+    """The folder of the shipped recipes' YAML and of groups such as ``task`` and ``profile``."""
     return shipped_folder() / "conf"
 
 
@@ -40,7 +47,7 @@ class Recipe:
     """A recipe's Python file and its YAML file.
 
     Attributes:
-        word: what names it on the command line, a name or a path.
+        word: its name or path on the command line.
         path: its Python file.
         yaml: its settings.
     """
@@ -56,26 +63,19 @@ class Recipe:
 
     @property
     def is_shipped(self) -> bool:
-        """Whether it is the package's own rather than a copy."""
+        """Whether it comes with the package."""
         return self.path.parent == shipped_folder()
 
     @property
     def folders(self) -> list[Path]:
-        """Where modules of the user's own are looked for, besides installed packages."""
+        """Where to look for the user's own modules, besides installed packages."""
         here = [Path.cwd()]
         return here if self.is_shipped else list(dict.fromkeys([self.path.parent, *here]))
 
     @property
     def docstring(self) -> str:
         """The file's docstring, read without running the file; empty where there is none."""
-        try:
-            return ast.get_docstring(ast.parse(self.path.read_text("utf-8"))) or ""
-        except SyntaxError as error:
-            raise UserError(
-                f"{self.path} is not valid Python: {error.msg}, line {error.lineno}."
-            ) from error
-        except (ValueError, RecursionError, MemoryError) as error:
-            raise UserError(f"{self.path} is not Python as UTF-8 text ({error}).") from error
+        return ast.get_docstring(self.tree()) or ""
 
     def load(self) -> ModuleType:
         """Run the recipe's file as a module and check that it has ``Config`` and ``main``.
@@ -99,15 +99,25 @@ class Recipe:
             spec.loader.exec_module(module)
         except ModuleNotFoundError as error:
             raise missing(str(self.path), error, *self.folders) from error
-        self.check_config(getattr(module, "Config", None))
+        self.checked(getattr(module, "Config", None))
         if not callable(getattr(module, "main", None)):
             raise UserError(f"{self.path} has no `main(cfg, out)`.")
         return module
 
+    def tree(self) -> ast.Module:
+        """The file's syntax tree."""
+        try:
+            return ast.parse(self.path.read_text("utf-8"))
+        except SyntaxError as error:
+            raise UserError(
+                f"{self.path} is not valid Python: {error.msg}, line {error.lineno}."
+            ) from error
+        except (ValueError, RecursionError, MemoryError) as error:
+            raise UserError(f"{self.path} is not Python as UTF-8 text ({error}).") from error
+
     def _check_name(self) -> None:
-        """Refuse a file, such as an early copy, whose runs would be called as another recipe's."""
-        tree = ast.parse(self.path.read_text("utf-8") if self.docstring else "")
-        for node in ast.walk(tree):
+        """Refuses a file, such as an early copy, that names its runs after another recipe."""
+        for node in ast.walk(self.tree()):
             if not isinstance(node, ast.Call) or not isinstance(node.func, ast.Attribute):
                 continue
             words = {word.arg: word.value for word in node.keywords}
@@ -118,13 +128,73 @@ class Recipe:
                     f"not {self.name!r} as the file: write recipe=Path(__file__).stem."
                 )
 
-    def check_config(self, config: Any) -> type[Any]:
+    def checked(self, config: Any) -> type[Any]:
         """``config`` itself, refused unless it is a dataclass of RunConfig."""
         if isinstance(config, type) and is_dataclass(config) and issubclass(config, RunConfig):
             return config
         raise UserError(
             f"{self.path} has no `Config`, a dataclass of giril_rl.config.schema.RunConfig."
         )
+
+
+def config_class(recipe: Recipe) -> type[Any]:
+    """A recipe's ``Config``, for help and checks.
+
+    A recipe imports TorchRL at its top, which takes seconds. Only the statements that ``Config``
+    needs are run here; where they fail on their own, the whole file is loaded.
+
+    Raises:
+        UserError: as :meth:`Recipe.load`.
+
+    Examples:
+        >>> config_class(find("giril")).__name__
+        'Config'
+    """
+    module = ModuleType(f"giril_recipe_config_{recipe.name}")
+    sys.modules[module.__name__] = module
+    if recipe.docstring:
+        body = _statements_for("Config", recipe.tree().body)
+        if not recipe.is_shipped:
+            search_in(*recipe.folders)
+        code = compile(ast.Module(body, []), str(recipe.path), "exec", dont_inherit=True)
+        try:
+            exec(code, module.__dict__)
+            return recipe.checked(module.Config)
+        except Exception:
+            # The whole file either works or says what is wrong with it.
+            pass
+    return recipe.load().Config
+
+
+def _statements_for(name: str, body: list[ast.stmt]) -> list[ast.stmt]:
+    """The top-level statements that bind ``name``, and what those refer to."""
+    needed, kept = {name, "annotations"}, set[int]()
+    while True:
+        new = [
+            index
+            for index, statement in enumerate(body)
+            if index not in kept and needed & set(_bound(statement))
+        ]
+        if not new:
+            return [body[index] for index in sorted(kept)]
+        kept.update(new)
+        for index in new:
+            needed |= {node.id for node in ast.walk(body[index]) if isinstance(node, ast.Name)}
+
+
+def _bound(statement: ast.stmt) -> Iterator[str]:
+    """The names that a statement binds."""
+    if isinstance(statement, (ast.ClassDef, ast.FunctionDef)):
+        yield statement.name
+        return
+    for node in ast.walk(statement):
+        if isinstance(node, (ast.Import, ast.ImportFrom)):
+            for alias in node.names:
+                yield (alias.asname or alias.name).partition(".")[0]
+        elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
+            yield node.id
+        elif isinstance(node, (ast.ClassDef, ast.FunctionDef)):
+            yield node.name
 
 
 def shipped() -> list[Recipe]:
@@ -134,11 +204,12 @@ def shipped() -> list[Recipe]:
         >>> "giril" in [recipe.name for recipe in shipped()]
         True
     """
-    return [
-        Recipe(path.stem, path, shipped_conf() / f"{path.stem}.yaml")
-        for path in sorted(shipped_folder().glob("*.py"))
-        if not path.stem.startswith("_")
-    ]
+    found = []
+    for path in sorted(shipped_folder().glob("[!_]*.py")):
+        own = shipped_conf() / f"{path.stem}.yaml"
+        settings = own if own.is_file() else shipped_conf() / "recipe.yaml"
+        found.append(Recipe(path.stem, path, settings))
+    return found
 
 
 def find(text: str) -> Recipe:
@@ -196,3 +267,28 @@ def copy(recipe: Recipe, file: Path) -> tuple[Path, Path]:
     shutil.copyfile(recipe.path, file)
     shutil.copyfile(recipe.yaml, settings)
     return file, settings
+
+
+def load_yaml(path: Path) -> Any:
+    """A YAML file of settings that anybody may have written, as OmegaConf reads it.
+
+    OmegaConf takes 1e-4 for a number and refuses a key that is given twice.
+
+    Raises:
+        UserError: where it is not valid YAML, or not safe to read.
+    """
+    try:
+        check_yaml(read_text(path))
+        return OmegaConf.load(path)
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        line = f", line {mark.line + 1}" if mark else ""
+        problem = getattr(error, "problem", None) or "not valid"
+        raise UserError(f"{path} is not valid YAML{line}: {problem}; correct it.") from error
+    except (OSError, ValueError, OmegaConfBaseException) as error:
+        raise UserError(f"{path} cannot be read as YAML: {first_line(error)}.") from error
+
+
+def first_line(error: Exception) -> str:
+    """The first line of an error's message, without a full stop."""
+    return (str(error).strip().splitlines() or [type(error).__name__])[0].rstrip(".")
