@@ -2,6 +2,8 @@
 
 from importlib.metadata import version as installed
 
+from giril_rl.methods import methods
+
 project = "giril_rl"
 author = "giril_rl contributors"
 release = version = installed("giril-rl")
@@ -11,7 +13,7 @@ extensions = [
     "sphinx.ext.napoleon",
     "sphinx.ext.viewcode",
 ]
-myst_enable_extensions = ["dollarmath", "colon_fence"]
+myst_enable_extensions = ["dollarmath", "colon_fence", "substitution"]
 myst_heading_anchors = 3
 html_theme = "furo"
 html_title = f"giril_rl {release}"
@@ -22,3 +24,11 @@ autodoc_typehints = "description"
 autodoc_typehints_description_target = "documented"
 napoleon_use_ivar = True
 nitpicky = False
+
+rows = [
+    f"| [{method.label}](methods/{'controls' if method.kind == 'control' else name}.md) | {method.trained} |"
+    for name, method in methods().items()
+]
+myst_substitutions = {
+    "methods": "\n".join(["| method | its reward model is trained |", "|---|---|", *rows])
+}

@@ -13,12 +13,15 @@ from typing import Any
 
 MOVED = {
     "configs": "config.schema",
+    "envs.atari_game": "envs.atari_preprocessing",
+    "envs.atari_gym": "envs.atari_family",
+    "envs.make": "envs.families",
     "methods.control_rewards": "methods.controls",
-    "networks.acting": "policies.acting",
-    "networks.agents": "policies.agents",
+    "networks.acting": "policies.agent",
+    "networks.agents": "policies.making",
     "networks.pixel_discriminators": "networks.pixels",
-    "networks.pixel_policy": "policies.pixel_policy",
-    "networks.policy": "policies.policy",
+    "networks.pixel_policy": "policies.pixel_actor_critic",
+    "networks.policy": "policies.actor_critic",
     "pretrained": "runs.pretrained",
     "rewards.affine": "rewards.controls",
     "rewards.bottleneck_loss": "rewards.bottleneck",
@@ -32,7 +35,7 @@ MOVED = {
     "rewards.noise": "rewards.controls",
     "rewards.pixel_scaler": "rewards.scaler",
     "rewards.transition_loss": "rewards.fitting",
-    "training.checkpoint": "files.checkpoint",
+    "training.checkpoint": "runs.checkpoint",
     "training.run": "runs.run",
 }
 """Modules that version 0.1 documented, or that its recipes import, below ``giril_rl``."""

@@ -1,95 +1,64 @@
 """VAIL: GAIL with a discriminator that sees a pair only through an information bottleneck.
 
-Expert -> demonstration -> discriminator <-> PPO on its reward -> score on the true reward.
+Demonstration -> discriminator <-> PPO on its reward -> score on the true reward.
 """
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from torchrl.envs import Compose
 
-from giril_rl.config.schema import (
-    DemoConfig,
-    ExpertConfig,
-    ScalingConfig,
-    UnaveragedRunConfig,
-)
+from giril_rl.config.schema import RewardRunConfig
 from giril_rl.demos import subsample
 from giril_rl.envs import make_env
 from giril_rl.rewards import BottleneckConfig, BottleneckLoss, bottleneck_reward
 from giril_rl.training import (
-    AdversarialLearner,
-    Run,
-    check_inputs,
+    PPO,
+    AdversarialTrainer,
     finish_run,
     make_agent,
     obtain_demonstration,
+    open_run,
     return_scaling,
-    train_ppo,
+    train_policy,
 )
 from giril_rl.transforms import IntrinsicReward
 
 
 @dataclass
-class Config(UnaveragedRunConfig):
+class Config(RewardRunConfig):
     """What `giril run vail` takes."""
 
-    expert: ExpertConfig = field(default_factory=ExpertConfig)
-    demo: DemoConfig = field(default_factory=DemoConfig)
     reward: BottleneckConfig = field(default_factory=BottleneckConfig)
-    scaling: ScalingConfig = field(default_factory=ScalingConfig)
 
 
 def main(cfg: Config, out: Path) -> None:
     """Train the whole chain and leave its run folder in ``out``."""
-    check_inputs(cfg, cfg.expert, cfg.demo)
-    with Run.open(out, asdict(cfg), recipe=Path(__file__).stem, logger=cfg.logger) as run:
+    with open_run(cfg, out, recipe=Path(__file__).stem) as run:
         if run.finished:
             return
-        demo, expert = obtain_demonstration(cfg, cfg.expert, cfg.demo)
+        demo, expert = obtain_demonstration(cfg)
         pairs = subsample(demo, cfg.demo.subsample)
         env = run.closing(make_env(cfg.task, cfg.ppo.num_envs, cfg.seed))
 
-        reward_seed = cfg.seed if cfg.reward.seed is None else cfg.reward.seed
-        reward = bottleneck_reward(cfg.reward, env, pairs, seed=reward_seed).to(cfg.device)
-        learner = AdversarialLearner(
-            BottleneckLoss(
-                reward,
-                information=cfg.reward.information,
-                beta_step=cfg.reward.beta_step,
-                beta=cfg.reward.beta_start,
-                penalty=cfg.reward.penalty,
-            ),
-            pairs,
-            cfg.reward,
-            seed=reward_seed,
+        seed = cfg.reward_seed
+        reward = bottleneck_reward(cfg.reward, env, pairs, seed=seed).to(cfg.device)
+        loss = BottleneckLoss(
+            reward,
+            information=cfg.reward.information,
+            beta_step=cfg.reward.beta_step,
+            beta=cfg.reward.beta_start,
+            penalty=cfg.reward.penalty,
         )
+        trainer = AdversarialTrainer(loss, pairs, cfg.reward, seed=seed)
 
-        relabel = Compose(
+        transform = Compose(
             IntrinsicReward(reward),
             *return_scaling(cfg.scaling, cfg.ppo.gamma),
         )
         agent = make_agent(env, cfg.ppo, cfg.seed).to(cfg.device)
-        trained = train_ppo(
-            env,
-            agent,
-            relabel,
-            cfg.ppo,
-            steps=cfg.steps,
-            seed=cfg.seed,
-            run=run,
-            termination=cfg.termination,
-            learn_reward=learner,
-        )
-        finish_run(
-            run,
-            cfg,
-            agent,
-            trained,
-            expert=expert,
-            demo=demo,
-            reward=reward,
-            seeds={"reward": reward_seed},
-        )
+        ppo = PPO(agent, cfg.ppo, steps=cfg.steps, termination=cfg.termination)
+        trained = train_policy(env, ppo, transform, seed=cfg.seed, run=run, reward_trainer=trainer)
+        finish_run(run, cfg, agent, trained, expert=expert, demo=demo, reward=reward)

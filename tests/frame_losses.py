@@ -7,8 +7,8 @@ from tensordict import TensorDict
 from torchrl.data import Categorical
 
 from giril_rl.config.schema import PPOConfig
-from giril_rl.graphs.traced import TracedGradients
-from giril_rl.policies.pixel_policy import PixelActorCritic
+from giril_rl.graphs import TracedGradients
+from giril_rl.policies import PixelActorCritic
 from giril_rl.rewards import (
     BottleneckLoss,
     BottleneckReward,
@@ -19,7 +19,7 @@ from giril_rl.rewards import (
     GenerativeReward,
     GenerativeRewardLoss,
 )
-from giril_rl.training.ppo import PPOLearner
+from giril_rl.training.ppo import PPO
 
 
 def frames(rows):
@@ -41,7 +41,7 @@ def discriminated(reward_cls, loss_cls, rows, penalty=0.0):
 
 def ppo(rows):
     agent = PixelActorCritic(4)
-    learner = PPOLearner(agent, PPOConfig(clip_value=True, entropy_coef=0.01), total_steps=8)
+    learner = PPO(agent, PPOConfig(clip_value=True, entropy_coef=0.01), steps=8)
     rows = {
         "action": torch.randint(4, (rows,)),
         agent.input_keys[0]: agent.actor.deal(frames(rows)),

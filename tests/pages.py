@@ -16,7 +16,7 @@ from giril_rl import IntrinsicReward
 from giril_rl.config.schema import TaskConfig
 from giril_rl.demos import Demonstration, record_demonstration
 from giril_rl.envs import AtariGymEnv, gym_factory, make_env
-from giril_rl.policies.agents import agent_for
+from giril_rl.policies import agent_for
 from giril_rl.rewards import GenerativeReward
 from giril_rl.rewards import fit as whole_fit
 

@@ -4,13 +4,13 @@ import json
 import math
 
 import pytest
+from short_runs import weights
 
 from giril_rl.cli.command_line import main
 from giril_rl.config.compose import resolved
 from giril_rl.config.recipe_config import config_class
 from giril_rl.config.recipe_files import find
 from giril_rl.errors import UserError
-from giril_rl.files.checkpoint import load_state
 from giril_rl.runs.metrics import read_metrics
 
 TINY = [
@@ -35,11 +35,6 @@ def run(out, root, *words):
     by_key = {word.split("=")[0]: word for word in [*TINY, f"out={out}", f"root={root}", *words]}
     assert main(["run", "bc", *by_key.values()]) == 0
     return json.loads((out / "result.json").read_text())
-
-
-def weights(folder):
-    state = load_state(folder / "policy/model.safetensors")
-    return {name: value.tolist() for name, value in state.items()}
 
 
 @pytest.mark.parametrize("task", ["task.env_id=CartPole-v1", "task=inverted_pendulum"])

@@ -14,7 +14,7 @@ from pixels import Pixels, steer
 
 from giril_rl.cli.command_line import main
 from giril_rl.demos import record_demonstration
-from giril_rl.files.disk import processor
+from giril_rl.runs.machine import processor
 
 
 @pytest.fixture

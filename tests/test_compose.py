@@ -8,7 +8,7 @@ from giril_rl.config.recipe_config import config_class
 from giril_rl.config.recipe_files import copy, find, shipped
 from giril_rl.config.schema import RunConfig, TaskConfig
 from giril_rl.errors import UserError
-from giril_rl.runs.naming import config_hash, out_folder, safe, variant
+from giril_rl.runs.identity import config_hash, out_folder, safe, variant
 
 GIRIL = find("giril")
 CONFIG = config_class(GIRIL)

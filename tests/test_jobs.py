@@ -5,7 +5,7 @@ import pytest
 from giril_rl.config.jobs import Jobs
 from giril_rl.config.recipe_config import config_class
 from giril_rl.config.recipe_files import copy, find
-from giril_rl.runs.naming import out_folder
+from giril_rl.runs.identity import out_folder
 
 JOBS = Jobs()
 

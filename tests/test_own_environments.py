@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from short_runs import TINY
 
 from giril_rl.cli.command_line import main
 from giril_rl.config.compose import resolved
@@ -36,8 +37,7 @@ class Own(gymnasium.Env):
 
 gymnasium.register("Own-v0", entry_point=Own, max_episode_steps=20)
 """
-TINY = ["ppo.num_envs=2", "ppo.rollout=8", "ppo.minibatch=8", "ppo.epochs=1", "ppo.hidden=[4]"]
-TINY += ["steps=16", "eval.episodes=2", "logger=null"]
+WORDS = [*TINY, "steps=16", "eval.episodes=2"]
 
 
 @pytest.fixture
@@ -63,7 +63,7 @@ def refused(capsys, *words):
 
 
 def test_a_run_on_it_is_made_and_scored(own, capsys):
-    words = ["run", "control", "task.env_id=own_envs:Own-v0", *TINY]
+    words = ["run", "control", "task.env_id=own_envs:Own-v0", *WORDS]
     assert main(words) == 0
     run = "runs/control/own_envs-Own-v0/"
     (result,) = Path(run).glob("*/seed0/result.json")
@@ -80,7 +80,7 @@ def test_a_run_on_it_is_made_and_scored(own, capsys):
 
 
 def test_modules_may_be_named_apart_and_change_no_name(own):
-    assert main(["run", "control", "imports=[own_envs]", "task.env_id=Own-v0", *TINY]) == 0
+    assert main(["run", "control", "imports=[own_envs]", "task.env_id=Own-v0", *WORDS]) == 0
     (result,) = Path("runs/control/Own-v0").glob("*/seed0/result.json")
     assert "imports" not in result.parent.parent.name
     own()
@@ -92,7 +92,7 @@ def test_a_copied_recipe_finds_what_lies_beside_it(own, tmp_path, monkeypatch):
     Path("mine.py").write_text(Path("mine.py").read_text() + "\nimport own_envs\n")
     (tmp_path / "elsewhere").mkdir()
     monkeypatch.chdir("elsewhere")
-    assert main(["run", "../mine.py", "task.env_id=Own-v0", "out=o", *TINY]) == 0
+    assert main(["run", "../mine.py", "task.env_id=Own-v0", "out=o", *WORDS]) == 0
 
 
 @pytest.mark.parametrize(
@@ -122,7 +122,7 @@ def test_a_module_that_cannot_be_used_is_named(own, text, sentence, tmp_path, ca
     shutil.rmtree("__pycache__", ignore_errors=True)
     if text is not None:
         Path("own_envs.py").write_text(text)
-    found = refused(capsys, "run", "control", "task.env_id=own_envs:Own-v0", *TINY)
+    found = refused(capsys, "run", "control", "task.env_id=own_envs:Own-v0", *WORDS)
     assert found.startswith(sentence.replace("HERE", str(tmp_path)))
     assert not Path("runs").exists()
 

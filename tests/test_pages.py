@@ -34,7 +34,16 @@ ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 NAMES = [page.relative_to(ROOT).as_posix() for page in PAGES]
 BLOCK = re.compile(r"(?:^<!-- not run: (.+) -->\n)?^```(\S*)[^\n]*\n(.*?)^```$", re.M | re.S)
-LANGUAGES = {"python", "sh", "yaml", "text", "{toctree}", "{eval-rst}", "{literalinclude}"}
+LANGUAGES = {
+    "python",
+    "sh",
+    "yaml",
+    "text",
+    "bibtex",
+    "{toctree}",
+    "{eval-rst}",
+    "{literalinclude}",
+}
 ELSEWHERE = {"ray", "pytest", "sphinx-build", "pre-commit"}  # Commands that are not ours.
 INLINE = re.compile(r"`(giril (?:run|study|cp|ls|eval|demo|report)\b[^`]*)`")
 SHOWN = re.compile(r"^ +((?:giril|python|cp) .+)$", re.M)  # In a docstring.

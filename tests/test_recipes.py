@@ -14,10 +14,11 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.envs.classic_control.cartpole import CartPoleEnv
+from short_runs import weights
 
 from giril_rl.cli.command_line import main
 from giril_rl.envs import GymVectorEnv
-from giril_rl.files.checkpoint import load_state
+from giril_rl.runs.checkpoint import load_state
 from giril_rl.runs.metrics import read_metrics
 
 BATCH = 128
@@ -84,12 +85,6 @@ def timeless(folder):
     """Metrics less what a clock says."""
     rows = read_metrics(Path(folder) / "metrics.jsonl")
     return [{k: v for k, v in row.items() if "seconds" not in k} for row in rows]
-
-
-def weights(folder):
-    """Every tensor of the policy, bit for bit; the file's own header has no fixed order."""
-    state = load_state(Path(folder) / "policy/model.safetensors")
-    return {name: (str(value.dtype), value.tolist()) for name, value in state.items()}
 
 
 def stamps(folder):

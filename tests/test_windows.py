@@ -5,7 +5,7 @@ import signal
 from types import SimpleNamespace
 
 from giril_rl.experiments.study.local import LocalLauncher
-from giril_rl.graphs.compiled import _compiling
+from giril_rl.graphs.compiling import _compiling
 
 
 def test_runs_are_killed_without_the_signals_name(monkeypatch):

@@ -35,7 +35,7 @@ from giril_rl.config.schema import PPOConfig, TaskConfig
 from giril_rl.demos import Demonstration, import_demonstration, subsample
 from giril_rl.envs import make_env
 from giril_rl.rewards import ConstantReward, GenerativeReward, GenerativeRewardLoss, fit
-from giril_rl.training import RandomPolicy, Run, Scores, evaluate, make_agent, train_ppo
+from giril_rl.training import PPO, RandomPolicy, Run, Scores, evaluate, make_agent, train_policy
 
 # 1. The environment. Observations are a vector, actions a Box or Discrete, and there is a time
 #    limit. Everything random comes from `self.np_random`, so that a seed repeats an episode.
@@ -123,7 +123,7 @@ def train(reward, folder: Path, steps: int, seed: int = 0):
     agent = make_agent(env, cfg, seed)
     relabel = Compose(IntrinsicReward(reward), ReturnScaling(cfg.gamma))
     with Run.open(folder, {"steps": steps, "seed": seed}, recipe="tutorial") as run:
-        train_ppo(env, agent, relabel, cfg, steps=steps, seed=seed, run=run)
+        train_policy(env, PPO(agent, cfg, steps=steps), relabel, seed=seed, run=run)
     return agent
 
 

@@ -26,7 +26,7 @@ from giril_rl.config.schema import PPOConfig, TaskConfig
 from giril_rl.demos import record_demonstration
 from giril_rl.envs import gym_factory, make_env
 from giril_rl.rewards import ConstantReward, ObservationScaler
-from giril_rl.training import Run, Scores, evaluate, make_agent, train_ppo
+from giril_rl.training import PPO, Run, Scores, evaluate, make_agent, train_policy
 
 # The reward. From here ...
 
@@ -82,7 +82,7 @@ def train(reward: TensorDictModuleBase, folder: Path, steps: int, seed: int = 0)
     agent = make_agent(env, cfg, seed)
     relabel = Compose(IntrinsicReward(reward), ReturnScaling(cfg.gamma))
     with Run.open(folder, {"steps": steps, "seed": seed}, recipe="tutorial") as run:
-        train_ppo(env, agent, relabel, cfg, steps=steps, seed=seed, run=run)
+        train_policy(env, PPO(agent, cfg, steps=steps), relabel, seed=seed, run=run)
     return agent
 
 

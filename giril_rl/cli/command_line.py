@@ -20,8 +20,8 @@ from giril_rl.cli.parser import check_number
 from giril_rl.config import recipe_files as recipes
 from giril_rl.config.nearest import did_you_mean
 from giril_rl.errors import FAILED, INTERRUPTED, RunError, UserError, told
-from giril_rl.files.places import check_place
-from giril_rl.runs.allocator import keep_freed_memory
+from giril_rl.files.disk import check_place
+from giril_rl.runs.machine import keep_freed_memory
 
 
 def _ls(argv: Sequence[str]) -> int:
@@ -82,8 +82,7 @@ def _run(argv: Sequence[str]) -> int:
     from giril_rl.config.jobs import Job, Jobs
     from giril_rl.config.overrides import sweep
     from giril_rl.config.validation import notices
-    from giril_rl.runs.naming import is_scored_as, out_folder
-    from giril_rl.runs.sources import check_sources, making, sources
+    from giril_rl.runs.identity import check_sources, is_scored_as, making, out_folder, sources
 
     composing = Jobs()
     jobs: dict[Path, tuple[Job, list[str]]] = {}

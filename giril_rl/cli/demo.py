@@ -117,12 +117,10 @@ def _run_show(args: Namespace) -> None:
     args.path = _found_folder(args.path)
     _check_picture(args.out, args.fps)
     from giril_rl.demos import Demonstration
-    from giril_rl.demos.show import describe
+    from giril_rl.demos.show import describe, write_gif
 
     found = Demonstration.load(args.path)
     if args.out is not None:
-        from giril_rl.demos.gif import write_gif
-
         write_gif(found, args.out, args.fps)
     print(describe(found))
 
@@ -132,8 +130,7 @@ def _run_import(args: Namespace) -> None:
     _check_new(args.out)
     check_number("--episodes", args.episodes, least=1)
     _import_modules(args)
-    from giril_rl.demos.importing import import_demonstration
-    from giril_rl.demos.task import named_task
+    from giril_rl.demos import import_demonstration, named_task
 
     task = named_task(args.task, args.env_id)
     found = import_demonstration(args.source, task, episodes=args.episodes, name=args.name)
@@ -145,7 +142,8 @@ def _run_import(args: Namespace) -> None:
 def _run_export(args: Namespace) -> None:
     """Write a demonstration for others, as a Minari dataset or a plain file."""
     args.path = _found_folder(args.path)
-    from giril_rl.demos import Demonstration, to_minari, to_npz
+    from giril_rl.demos import Demonstration, named_task, to_minari, to_npz
+    from giril_rl.envs import as_recorded_task, gym_factory
 
     found = Demonstration.load(args.path)
     if args.npz is not None:
@@ -153,9 +151,6 @@ def _run_export(args: Namespace) -> None:
         print(f"{args.npz} has {len(found):,} transitions, {found.num_episodes:,} episodes.")
         return
     _import_modules(args)
-    from giril_rl.demos.task import as_recorded_task, named_task
-    from giril_rl.envs import gym_factory
-
     env_id = args.env_id
     if args.task is None and env_id is None:
         env_id = found.card.get("env_id")
@@ -175,13 +170,13 @@ def _run_play(args: Namespace) -> None:
     check_number("--episodes", args.episodes, least=1)
     check_number("--seed", args.seed, least=0)
     _import_modules(args)
+    from giril_rl.demos import named_task
     from giril_rl.demos.play import Window, play_demonstration
-    from giril_rl.demos.task import as_recorded_task, named_task
-    from giril_rl.envs import gym_factory
+    from giril_rl.envs import as_recorded_task, gym_factory
 
     task = as_recorded_task(named_task(args.task, args.env_id), args.lives)
-    if not task.is_atari:
-        raise UserError(f"{task.name} is no Atari game: only those can be played by hand.")
+    if task.family.observation != "image":
+        raise UserError(f"{task.name} shows no images: only games can be played by hand.")
     make_fn = gym_factory(task)
     found = play_demonstration(
         make_fn,

@@ -11,7 +11,7 @@ from giril_rl.experiments.study.execute import Launcher, execute
 from giril_rl.experiments.study.plan import Planner, StudyRun
 from giril_rl.experiments.study.spec import find_study, read_spec
 from giril_rl.experiments.study.status import StudyFolder
-from giril_rl.files.places import check_place
+from giril_rl.files.disk import check_place
 
 
 def settings_of(texts: Sequence[str]) -> tuple[StudyConfig, list[str]]:

@@ -9,7 +9,7 @@ composed, the override grammar and the sweeps are Hydra's all the same.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, is_dataclass
 from pathlib import Path
 from typing import Any
@@ -21,10 +21,10 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from giril_rl.config.families import GYMNASIUM, family_of
 from giril_rl.config.leaves import flat
 from giril_rl.config.overrides import KeyCheck, check_settings, normalised, parse
 from giril_rl.config.recipe_files import Recipe, shipped_conf
-from giril_rl.config.schema import is_atari
 from giril_rl.config.task_defaults import apply_task_defaults
 from giril_rl.errors import UserError
 from giril_rl.files.untrusted import check_references, check_yaml, read_text
@@ -156,11 +156,11 @@ def groups(recipe: Recipe) -> dict[str, tuple[list[str], str]]:
     return found
 
 
-def _with_task(texts: Sequence[str]) -> list[str]:
+def _with_task(texts: Sequence[str], tasks: Collection[str]) -> list[str]:
     given = dict(text.partition("=")[::2] for text in texts)
     if "task.env_id" in given and "task" not in given:
-        kind = "atari" if is_atari(given["task.env_id"].strip("'\"")) else "gymnasium"
-        return [f"task={kind}", *texts]
+        name = family_of(given["task.env_id"].strip("'\"")).name
+        return [f"task={name if name in tasks else GYMNASIUM.name}", *texts]
     return list(texts)
 
 
@@ -191,7 +191,7 @@ def compose(recipe: Recipe, config: type[Any], texts: Sequence[str]) -> Composed
     settings = OmegaConf.to_container(_load_settings(recipe), resolve=False)
     assert isinstance(settings, dict)
     check_settings(check, settings, str(recipe.yaml))  # type: ignore[arg-type]
-    overrides = parse(_with_task(texts))
+    overrides = parse(_with_task(texts, choices.get("task", ())))
     for override in overrides:
         check.override(override)
     chosen: dict[str, Any] = {group: default for group, (_, default) in found.items()}

@@ -14,6 +14,7 @@ from typing import Any
 from omegaconf import MISSING
 
 from giril_rl import moved
+from giril_rl.config.families import TaskFamily, family_of
 
 MOST = 2**63 - 1
 """The largest whole number of any knob: what torch takes for a seed or a size, and files keep."""
@@ -74,16 +75,6 @@ def split_id(env_id: str) -> tuple[str | None, str]:
     return (module if colon else None), name
 
 
-def is_atari(env_id: str) -> bool:
-    """Whether a Gymnasium id is one of the Arcade Learning Environment.
-
-    Examples:
-        >>> is_atari("ALE/Pong-v5"), is_atari("Pendulum-v1")
-        (True, False)
-    """
-    return split_id(env_id)[1].startswith("ALE/")
-
-
 @dataclass
 class TaskConfig:
     """The environment and what is known about it."""
@@ -122,9 +113,9 @@ class TaskConfig:
     )
 
     @property
-    def is_atari(self) -> bool:
-        """Whether the environment is one of the Arcade Learning Environment."""
-        return is_atari(self.env_id)
+    def family(self) -> TaskFamily:
+        """What is known of the environment by its id alone."""
+        return family_of(self.env_id)
 
 
 @dataclass
@@ -265,14 +256,6 @@ class RunConfig:
     """What all recipes share."""
 
     task: TaskConfig = field(default_factory=TaskConfig)
-    profile: str = knob(
-        "released",
-        "released (reward averaged over environments) or paper (eq. 2)",
-        choices=("released", "paper"),
-    )
-    batch_mean: bool = knob(
-        True, "average each step's reward over the environments (profile released)"
-    )
     seed: int = knob(0, "seed of the policy's training", low=0)
     steps: int = knob(MISSING, "policy environment steps", low=1)
     out: str | None = knob(
@@ -295,35 +278,72 @@ class RunConfig:
         "where networks and batches are; environments stay on the CPU",
         choices=("cpu", "cuda"),
     )
-    termination: str = knob(
-        "ends",
-        "ends: nothing comes after a failure; bootstrap: its value continues as after a time limit",
-        choices=("ends", "bootstrap"),
-    )
     ppo: PPOConfig = field(default_factory=PPOConfig)
     eval: EvalConfig = field(default_factory=EvalConfig)
 
 
 @dataclass
-class UnaveragedRunConfig(RunConfig):
-    """What recipes share that never average a reward: both profiles give the same run."""
-
-    profile: str = knob(
-        "released",
-        "no effect here: nothing is averaged, both profiles are the same run",
-        choices=("released", "paper"),
-    )
-    batch_mean: bool = knob(True, "no effect here")
-
-
-@dataclass
-class ExpertRunConfig(UnaveragedRunConfig):
+class ExpertRunConfig(RunConfig):
     """What the expert's own recipe takes: PPO on the true reward."""
 
     steps: int = knob(5_000_000, "most environment steps of expert training (paper: 5M)", low=1)
     stop_early: bool = knob(True, "stop once the mean return reaches task.expert_score")
     clip_reward: bool = knob(False, "learn from the reward's sign (Atari); scores are unclipped")
     scaling: ScalingConfig = field(default_factory=lambda: ScalingConfig(reset="done"))
+
+
+@dataclass
+class DemoRunConfig(RunConfig):
+    """What recipes share that learn from a demonstration."""
+
+    expert: ExpertConfig = field(default_factory=ExpertConfig)
+    demo: DemoConfig = field(default_factory=DemoConfig)
+
+    @property
+    def needs_demonstration(self) -> bool:
+        """Whether the run learns from a demonstration, and so from an expert."""
+        return True
+
+
+@dataclass
+class RewardRunConfig(DemoRunConfig):
+    """What recipes share that train a policy on a reward of the demonstration."""
+
+    scaling: ScalingConfig = field(default_factory=ScalingConfig)
+    termination: str = knob(
+        "ends",
+        "ends: nothing comes after a failure; bootstrap: its value continues as after a time limit",
+        choices=("ends", "bootstrap"),
+    )
+
+    @property
+    def reward_seed(self) -> int:
+        """Seed of the reward model: ``reward.seed``, or the run's."""
+        own = getattr(getattr(self, "reward", None), "seed", None)
+        return self.seed if own is None else own
+
+
+@dataclass
+class AveragedRunConfig(RewardRunConfig):
+    """What recipes share whose reward may be averaged over the environments."""
+
+    profile: str = knob(
+        "released",
+        "released (reward averaged over environments) or paper (eq. 2)",
+        choices=("released", "paper"),
+    )
+    batch_mean: bool = knob(
+        True, "average each step's reward over the environments (profile released)"
+    )
+
+
+@dataclass
+class UnaveragedRunConfig(RunConfig):
+    """Deprecated, for recipes that were copied from version 0.1: take :class:`RunConfig`."""
+
+    profile: str = knob("released", "no effect", choices=("released", "paper"))
+    batch_mean: bool = knob(True, "no effect")
+    termination: str = knob("ends", "no effect here", choices=("ends", "bootstrap"))
 
 
 def __getattr__(name: str) -> Any:

@@ -1,4 +1,4 @@
-"""Settings that a task or its kind changes in every recipe."""
+"""Settings that a task or its family changes in every recipe."""
 
 from __future__ import annotations
 
@@ -9,19 +9,18 @@ from typing import Any
 
 import yaml
 
+from giril_rl.config.families import family_of
 from giril_rl.config.leaves import flat
 from giril_rl.config.recipe_files import shipped_conf
-from giril_rl.config.schema import is_atari
 
 
 @cache
-def _atari() -> dict[str, Any]:
-    text = (shipped_conf() / "kind" / "atari.yaml").read_text(encoding="utf-8")
-    return flat(yaml.safe_load(text))
+def _shipped(name: str) -> dict[str, Any]:
+    return yaml.safe_load((shipped_conf() / "kind" / f"{name}.yaml").read_text(encoding="utf-8"))
 
 
 def task_defaults(env_id: str, chosen: Collection[str] = ()) -> dict[str, Any]:
-    """What a task's kind changes, by dotted key, less what somebody chose.
+    """What a task's family changes, by dotted key, less what somebody chose.
 
     Args:
         env_id: the task's Gymnasium id.
@@ -31,11 +30,12 @@ def task_defaults(env_id: str, chosen: Collection[str] = ()) -> dict[str, Any]:
         >>> task_defaults("ALE/Pong-v5")["ppo.num_envs"], task_defaults("Pendulum-v1")
         (8, {})
     """
-    if not is_atari(env_id):
-        return {}
+    settings = family_of(env_id).settings or {}
+    if isinstance(settings, str):
+        settings = _shipped(settings)
     return {
         key: value
-        for key, value in _atari().items()
+        for key, value in flat(settings).items()
         if not any(key == one or key.startswith(f"{one}.") for one in chosen)
     }
 

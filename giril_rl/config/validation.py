@@ -55,11 +55,11 @@ def _check_ppo(key: str, ppo: PPOConfig) -> None:
 
 
 def _check_task(key: str, task: TaskConfig) -> None:
-    if task.is_atari and task.horizon != "own":
+    if task.horizon != "own" and not task.family.fixed_horizon:
         raise UserError(
             f"{key}.horizon={task.horizon} is for vector tasks: leave {key}.horizon=own."
         )
-    if task.episode != "life" and not task.is_atari:
+    if task.episode != "life" and not task.family.has_lives:
         raise UserError(
             f"{key}.episode={task.episode} is for games, whose lives end episodes: leave "
             f"{key}.episode=life."
@@ -72,14 +72,11 @@ def _check_task(key: str, task: TaskConfig) -> None:
 
 
 def _check_expert_run(config: ExpertRunConfig) -> None:
-    for key, value, only in (
-        ("task.horizon", config.task.horizon, "own"),
-        ("termination", config.termination, "ends"),
-    ):
-        if value != only:
-            raise UserError(
-                f"{key}={value}: an expert plays the task as it is; leave {key}={only}."
-            )
+    if config.task.horizon != "own":
+        raise UserError(
+            f"task.horizon={config.task.horizon}: an expert plays the task as it is; leave "
+            "task.horizon=own."
+        )
 
 
 def _check_cloning(config: Any, cloning: BCConfig) -> None:
@@ -97,15 +94,16 @@ def _check_cloning(config: Any, cloning: BCConfig) -> None:
 
 def _check_normalise(config: Any) -> None:
     """Frames have one rule of normalisation, and it is for nothing else."""
+    images = config.task.family.observation == "image"
     for part in fields(config):
         rule = getattr(getattr(config, part.name), "normalise", None)
-        if rule is not None and (rule == "pixels") != config.task.is_atari:
-            right = "pixels" if config.task.is_atari else "standardise"
+        if rule is not None and (rule == "pixels") != images:
+            right = "pixels" if images else "standardise"
             raise UserError(
                 f"{part.name}.normalise={rule} does not fit the observations of "
                 f"{config.task.name}: set {part.name}.normalise={right}."
             )
-    if config.task.is_atari and config.ppo.normalise_observations:
+    if images and config.ppo.normalise_observations:
         raise UserError(
             f"ppo.normalise_observations=true is for vectors, and {config.task.name} has frames, "
             "which are divided by 255: leave it out."
@@ -128,7 +126,7 @@ def _check_run(config: Any) -> None:
     if isinstance(config, RunConfig):
         check_names(config.imports)
         _check_normalise(config)
-        if config.task.is_atari:
+        if config.task.family.observation == "image":
             _check_layers(config)
     if isinstance(config, ExpertRunConfig):
         _check_expert_run(config)

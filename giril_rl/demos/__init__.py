@@ -1,4 +1,4 @@
-"""Demonstrations: record, check, keep, subsample, import and export."""
+"""Demonstrations: record, check, save, subsample, import and export."""
 
 from giril_rl.demos.check import check_demonstration
 from giril_rl.demos.demonstration import Demonstration

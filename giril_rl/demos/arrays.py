@@ -1,37 +1,48 @@
-"""From the plain arrays of someone else's data set to the columns of a demonstration."""
+"""Arrays of other people's data sets: checked, named and turned into transitions."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+import re
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from giril_rl.demos.names import check_names
+from giril_rl.config.nearest import nearest
 from giril_rl.errors import UserError
+from giril_rl.files.untrusted import parse_json
 
 NEEDED = ("observation", "action", "next_observation", "terminated", "truncated")
-"""One row per transition each; ``reward`` may be there as well."""
+"""Columns with one row per transition; ``reward`` is optional."""
 _FLAGS = ("terminated", "truncated")
+_CALLED = {
+    "obs": "observation",
+    "state": "observation",
+    "act": "action",
+    "rew": "reward",
+    "terminal": "terminated",
+    "timeout": "truncated",
+}
+"""Words of other libraries. Not ``done``, which does not say which kind of end it is."""
 _NUMBERS = "fiub"  # numpy's kinds: float, signed and unsigned integer, bool
 
 
 def to_transitions(columns: Mapping[str, np.ndarray]) -> TensorDict:
-    """One row per transition as a demonstration stores it; nothing about it is proved yet.
+    """Transitions as a demonstration stores them, not yet checked for alignment.
 
-    Numbers of observations, continuous actions and rewards become float32, as the recorder makes
-    them, integer actions int64; images, uint8 [N, c, h, w], stay what they are. ``done`` is
-    terminated or truncated; ``episode`` and ``step``, if not there, are counted from it. Rewards
-    that are not there are zeros.
+    Observations, continuous actions and rewards become float32, integer actions int64; images,
+    uint8 [N, c, h, w], stay as they are. ``done`` is terminated or truncated. Missing ``episode``
+    and ``step`` are counted from it; missing rewards become zeros.
 
     Args:
         columns: arrays named as in :data:`NEEDED`, and ``reward``, ``episode`` and ``step`` if
             known; flags and rewards [N] or [N, 1].
 
     Raises:
-        UserError: for a column that is missing, of another length, or no numbers.
+        UserError: for a column that is missing, of another length, or not numeric.
 
     Examples:
         >>> zero = np.zeros((3, 2), np.float32)
@@ -83,14 +94,14 @@ def to_transitions(columns: Mapping[str, np.ndarray]) -> TensorDict:
 
 
 def from_episodes(episodes: Iterable[Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
-    """Columns for :func:`to_transitions` of whole episodes with one more observation than actions.
+    """Columns for :func:`to_transitions` from episodes with one observation more than actions.
 
     Args:
         episodes: each with ``observations`` [T + 1, ...], ``actions`` [T, ...], ``terminated`` and
             ``truncated`` [T], and ``rewards`` [T] in all or none of them.
 
     Raises:
-        UserError: naming the episode whose next states are missing or whose numbers do not match.
+        UserError: naming the episode whose next states are missing or whose lengths differ.
 
     Examples:
         >>> no = np.zeros(2, bool)
@@ -118,7 +129,7 @@ def from_episodes(episodes: Iterable[Mapping[str, np.ndarray]]) -> dict[str, np.
             "next_observation": observations[1:],
             "terminated": episode["terminated"],
             "truncated": episode["truncated"],
-            # Not counted from the ends: they are to be where the episodes end.
+            # Not counted from the flags, which are checked against these.
             "episode": np.full(len(actions), number, np.int64),
             "step": np.arange(len(actions), dtype=np.int64),
         }
@@ -137,6 +148,15 @@ def from_episodes(episodes: Iterable[Mapping[str, np.ndarray]]) -> dict[str, np.
         raise UserError(f"the data set's episodes do not fit each other ({error}).") from None
 
 
+def parse_card(text: object) -> dict[str, Any]:
+    """The card of an export of ours; empty for anything else that may stand there."""
+    try:
+        card = parse_json(text)  # type: ignore[arg-type]
+    except (ValueError, TypeError):
+        card = None
+    return card if isinstance(card, dict) else {}
+
+
 def _described(array: np.ndarray) -> str:
     return f"{array.dtype} and shape {list(array.shape)}"
 
@@ -144,7 +164,7 @@ def _described(array: np.ndarray) -> str:
 def _float32(name: str, array: np.ndarray) -> np.ndarray:
     if array.dtype.kind not in _NUMBERS:
         raise UserError(f"the data set has {name} of {_described(array)}: numbers are needed.")
-    with np.errstate(over="ignore"):  # The check of infinities tells where.
+    with np.errstate(over="ignore"):  # The check for infinities says where.
         return np.ascontiguousarray(array, dtype=np.float32)
 
 
@@ -192,8 +212,56 @@ def _action(array: np.ndarray) -> Tensor:
 
 
 def _counted(done: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Numbers of the episode and of the step in it, both int64 [N], from where episodes end."""
+    """Episode numbers and steps within them, both int64 [N], counted from the ends."""
     fresh = np.concatenate([[True], done[:-1]])[: len(done)]
     episode = np.cumsum(fresh) - 1
     index = np.arange(len(done))
     return episode.astype(np.int64), (index - index[fresh][episode]).astype(np.int64)
+
+
+def _words(name: str) -> list[str]:
+    """Our words for ``name``, singular and sorted: ``obs_next`` equals ``next_observations``."""
+    words = [word if word in _CALLED else word.removesuffix("s") for word in re.split("[_.]", name)]
+    return sorted(_CALLED.get(word, word) for word in words)
+
+
+def meant(name: str, candidates: Iterable[str]) -> str | None:
+    """Which of ``candidates`` ``name`` probably stands for.
+
+    Examples:
+        >>> ours = ["observation", "action", "next_observation", "truncated"]
+        >>> [meant(name, ours) for name in ("obs", "obs_next", "timeouts", "acton", "dones")]
+        ['observation', 'next_observation', 'truncated', 'action', None]
+    """
+    candidates = list(candidates)
+    same = [candidate for candidate in candidates if _words(candidate) == _words(name)]
+    return next(iter(same or nearest(name, candidates)), None)
+
+
+def renamed(found: Collection[str], wanted: Iterable[str]) -> dict[str, str]:
+    """Those of ``wanted`` that ``found`` has under another name, with that name."""
+    wanted = list(wanted)
+    missing = [name for name in wanted if name not in found]
+    return {
+        ours: name
+        for name in found
+        if name not in wanted and (ours := meant(name, missing)) is not None
+    }
+
+
+def check_names(found: Collection[str], needed: Sequence[str], begin: str) -> None:
+    """Refuses a data set that lacks some of ``needed``, and guesses what it calls them."""
+    missing = [name for name in needed if name not in found]
+    if not missing:
+        return
+    others = renamed(found, needed)
+    note = ""
+    if "observation" in missing[0] and "next" in missing[0]:
+        note = ", so next states are missing"
+        if not others:
+            note += " (or give observations with one row more than actions in each episode)"
+    sentence = f"{begin} {', '.join(missing)}{note}: needed are {', '.join(needed)}"
+    if others:
+        pairs = " and ".join(f"{ours!r} by {name!r}" for ours, name in others.items())
+        raise UserError(f"{sentence}; did you mean {pairs}?")
+    raise UserError(f"{sentence}.")

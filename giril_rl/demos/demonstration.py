@@ -1,4 +1,4 @@
-"""What an expert did: aligned transitions, and a card that says where they come from."""
+"""An expert's transitions, and a card that says where they come from."""
 
 from __future__ import annotations
 
@@ -13,12 +13,17 @@ from tensordict import TensorDict
 from tensordict.utils import NestedKey
 from torch import Tensor
 
-from giril_rl.demos.check import check_demonstration
-from giril_rl.demos.frames import FRAMES_FILE, load_frames, save_frames
-from giril_rl.demos.storage import load_tensors, save_tensors
+from giril_rl.demos.storage import (
+    FRAMES_FILE,
+    load_frames,
+    load_tensors,
+    save_frames,
+    save_tensors,
+)
+from giril_rl.demos.transitions import check_transitions
 from giril_rl.errors import UserError
 from giril_rl.files.disk import name_file, read_json, temporary_sibling, write_json
-from giril_rl.files.formats import check_format
+from giril_rl.files.untrusted import check_format
 
 FORMAT_VERSION = 1
 """Of vectors."""
@@ -31,17 +36,17 @@ _IMAGES: list[NestedKey] = ["observation", ("next", "observation")]
 
 @dataclass(eq=False)
 class Demonstration:
-    """Transitions (s_t, a_t, s_{t+1}) of whole episodes in the order in which they were played.
+    """Transitions (s_t, a_t, s_{t+1}) of whole episodes, in the order in which they were played.
 
     Args:
-        transitions: flat TensorDict, batch [N]: ``observation`` float32 [N, d], raw, before any
-            running normalisation, or images, uint8 [N, c, h, w]; ``action``, as executed, float32
-            [N, a] or int64 [N]; ``("next", "observation")``, at an episode's end the true terminal
+        transitions: flat TensorDict, batch [N]: ``observation`` float32 [N, d], before any
+            normalisation, or images, uint8 [N, c, h, w]; ``action``, as executed, float32 [N, a] or
+            int64 [N]; ``("next", "observation")``, at an episode's end the true terminal
             observation; ``("next", "reward" | "done" | "terminated" | "truncated")`` [N, 1];
             ``episode`` and ``step`` int64 [N], both counted from 0.
         card: plain JSON values. ``length`` is the fixed number of transitions, which may cut the
             last episode, or None if all episodes are whole; ``seeds`` has one reset seed per
-            episode. See :func:`giril_rl.demos.record_demonstration` for the others.
+            episode. :func:`giril_rl.demos.record_demonstration` lists the others.
 
     Examples:
         >>> import gymnasium
@@ -69,12 +74,12 @@ class Demonstration:
 
     @property
     def has_rewards(self) -> bool:
-        """Whether the true rewards are known; where they are not, zeros stand for them."""
+        """Whether the true rewards are known; unknown ones are stored as zeros."""
         return self.card.get("rewards") is not False
 
     @property
     def num_episodes(self) -> int:
-        """How many episodes there are, the cut one included."""
+        """Number of episodes, a cut one included."""
         return int(self.transitions["episode"].max()) + 1 if len(self) else 0
 
     @property
@@ -91,7 +96,7 @@ class Demonstration:
 
     @property
     def demo_id(self) -> str:
-        """Twelve hex digits of sha256 of the transitions, whatever the card or the storage says.
+        """Twelve hex digits of the transitions' sha256, independent of card and storage.
 
         Examples:
             >>> one = Demonstration(TensorDict({"step": torch.arange(3)}, [3]), {"task": "reach"})
@@ -107,10 +112,16 @@ class Demonstration:
                 digest.update(part.cpu().contiguous().numpy())
         return digest.hexdigest()[:12]
 
-    def save(self, folder: Path | str) -> None:
-        """Write ``folder`` at once: a TensorDict memmap of tensors only, and ``card.json``.
+    def check(self) -> None:
+        """Refuses faults that show without the task, as :func:`check_demonstration` does first.
 
-        Images lie in ``frames.npz`` instead, each distinct frame once and compressed.
+        Raises:
+            UserError: naming the first fault found and where it is.
+        """
+        check_transitions(self.transitions, may_cut_last=self.card.get("length") is not None)
+
+    def save(self, folder: Path | str) -> None:
+        """Writes ``folder`` atomically: a TensorDict memmap, ``card.json``, and images' frames.
 
         Raises:
             UserError: if the demonstration is not sound, or ``folder`` is there already.
@@ -128,7 +139,7 @@ class Demonstration:
             True
         """
         folder = Path(folder)
-        check_demonstration(self)
+        self.check()
         if folder.is_file() or (folder.is_dir() and any(folder.iterdir())):
             raise UserError(f"{folder} is there already: choose another folder, or delete it.")
         folder.parent.mkdir(parents=True, exist_ok=True)
@@ -152,9 +163,9 @@ class Demonstration:
 
     @classmethod
     def load(cls, folder: Path | str) -> Demonstration:
-        """Read and check what :meth:`save` wrote; tensors are in memory, apart from the files.
+        """Reads into memory, and checks, what :meth:`save` wrote.
 
-        Nothing is unpickled: all metadata is inspected before anything is loaded, and a folder that
+        Nothing is unpickled: all metadata is checked before anything is loaded, and a folder that
         holds more than plain tensors is refused.
 
         Raises:
@@ -188,7 +199,7 @@ class Demonstration:
                 data.set(key, image)
         demo = cls(data, card)
         try:
-            check_demonstration(demo)
+            demo.check()
         except UserError as error:
             raise UserError(f"{folder}: {error}") from None
         return demo

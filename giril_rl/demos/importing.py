@@ -1,4 +1,4 @@
-"""Someone else's data set as a demonstration."""
+"""Other people's data sets as demonstrations."""
 
 from __future__ import annotations
 
@@ -9,51 +9,47 @@ from typing import Any
 import numpy as np
 
 from giril_rl.config.schema import TaskConfig
-from giril_rl.demos.arrays import to_transitions
+from giril_rl.demos.arrays import check_names, to_transitions
+from giril_rl.demos.check import check_for_task
 from giril_rl.demos.demonstration import Demonstration
-from giril_rl.demos.minari_read import read_minari
-from giril_rl.demos.names import check_names
+from giril_rl.demos.minari import read_minari
 from giril_rl.demos.npz import read_npz
 from giril_rl.demos.replay import verify_by_replay
 from giril_rl.demos.storage import load_tensors
-from giril_rl.demos.task import as_recorded_task, check_for_task
-from giril_rl.envs import gym_factory
+from giril_rl.envs import as_recorded_task, gym_factory
 from giril_rl.errors import UserError
-from giril_rl.files.disk import installed_versions
+from giril_rl.runs.machine import installed_versions
 
 MINARI = "minari:"
 _DTYPES = ("float32", "float64", "uint8", "int8", "int16", "int32", "int64", "bool")
 _NEEDED = ("observation", "action", "next.observation", "next.terminated", "next.truncated")
-_NEXT = {"observation": "next_observation", "reward": "reward"}
-_Read = tuple[dict[str, np.ndarray], dict[str, Any]]
 
 
 def import_demonstration(
     source: str, task: TaskConfig, *, episodes: int | None = None, name: str | None = None
 ) -> Demonstration:
-    """Read a data set and check it against a task; :meth:`Demonstration.save` then writes it.
+    """Reads a data set and checks it against a task; :meth:`Demonstration.save` then writes it.
 
-    Actions can be proved to belong to their states only by a replay, which needs the episodes'
-    seeds and rewards. Where the data set has both, it is tried; the card's ``replay`` says "same
-    bits", what differed, or why there was none. The card's ``rewards`` says whether they are known.
+    Only a replay can prove that actions belong to their states. It needs the episodes' seeds and
+    rewards. Where the data set has both, it is tried; the card's ``replay`` says "same bits", what
+    differed, or why there was none. The card's ``rewards`` says whether they are known.
 
     Args:
         source: ``minari:NAME``, a local dataset; an ``.npz`` file, see
             :func:`~giril_rl.demos.npz.read_npz`; or the folder of a TensorDict memmap with
             ``observation``, ``action`` and ``("next", "observation" | "terminated" |
             "truncated")``, batch [N].
-        task: what it is a demonstration of.
-        episodes: how many of it, the first ones; all if None.
+        task: the demonstrated task.
+        episodes: number of episodes to take, from the first; None takes all.
         name: what the card calls the source; its file's name if None.
 
     Raises:
-        UserError: in one sentence, for whatever is wrong with the data set or does not fit.
+        UserError: if the data set has a fault or does not fit the task.
 
     Examples:
         >>> import tempfile
         >>> from giril_rl.demos import record_demonstration, to_npz
-        >>> from giril_rl.demos.task import named_task
-        >>> cartpole = named_task(None, "CartPole-v1")
+        >>> cartpole = TaskConfig(name="cartpole", env_id="CartPole-v1")
         >>> demo = record_demonstration(
         ...     gym_factory(cartpole), lambda o: o.new_ones(1).long(), episodes=2, seed=0
         ... )
@@ -119,31 +115,29 @@ def _read_memmap(folder: Path) -> dict[str, np.ndarray]:
             f"{folder} has the batch shape {list(data.shape)}: flatten it to [N] transitions, "
             "episode after episode."
         )
-    found = [
+    names = [
         key if isinstance(key, str) else ".".join(key) for key in data.keys(True, leaves_only=True)
     ]
-    check_names(found, _NEEDED, f"{folder} has no")
-    keys: dict[str, Any] = {name: name for name in ("observation", "action", "episode", "step")}
-    keys |= {_NEXT.get(name, name): ("next", name) for name in (*_NEXT, "terminated", "truncated")}
-    columns = {
-        name: value.numpy()
-        for name, key in keys.items()
-        if (value := data.get(key, None)) is not None
-    }
-    done = data.get(("next", "done"), None)
-    ends = [columns[name] for name in ("terminated", "truncated") if name in columns]
-    if done is not None and len(ends) == 2 and not np.array_equal(done.numpy(), ends[0] | ends[1]):
+    check_names(names, _NEEDED, f"{folder} has no")
+    after = data["next"]
+    found = {name: data.get(name, None) for name in ("observation", "action", "episode", "step")}
+    found |= {name: after.get(name, None) for name in ("reward", "terminated", "truncated")}
+    found["next_observation"] = after["observation"]
+    columns = {name: value.numpy() for name, value in found.items() if value is not None}
+    done = np.logical_or(columns["terminated"], columns["truncated"])
+    if "done" in after and not np.array_equal(after["done"].numpy(), done):
         raise UserError(f"{folder} has next.done that is not terminated or truncated: mend it.")
     return columns
 
 
 def _believed(card: dict[str, Any], demo: Demonstration) -> dict[str, Any]:
-    """Those values of a card that anyone may have written which have the form they should."""
+    """The values of an untrusted card that have the right form."""
 
     def number(value: Any) -> Any:
         return value if type(value) is int and 0 <= value < 2**63 else None
 
     count, seeds, expert = demo.num_episodes, card.get("seeds"), card.get("expert")
+    played = card.get("deterministic")
     seeds = seeds[:count] if isinstance(seeds, list) else []
     known = len(seeds) == count and all(number(seed) is not None for seed in seeds)
     whole = bool(demo.transitions["next", "done"][-1])
@@ -152,7 +146,7 @@ def _believed(card: dict[str, Any], demo: Demonstration) -> dict[str, Any]:
         "seed": number(card.get("seed")),
         "seeds": seeds if known else [],
         "length": len(demo) if cut else None,
-        "deterministic": card.get("deterministic") if _plain(card.get("deterministic")) else None,
+        "deterministic": played if isinstance(played, bool) or played == "by hand" else None,
         "expert": None,
     }
     if isinstance(expert, dict):
@@ -167,12 +161,8 @@ def _believed(card: dict[str, Any], demo: Demonstration) -> dict[str, Any]:
     return believed
 
 
-def _plain(value: Any) -> bool:
-    return isinstance(value, bool) or value == "by hand"
-
-
 def _printable(text: str) -> str:
-    """A terminal may be told anything by a text with control characters."""
+    """``text`` without control characters, which could tell a terminal anything."""
     return "".join(letter for letter in text if letter.isprintable())[:100]
 
 

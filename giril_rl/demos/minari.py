@@ -1,9 +1,15 @@
-"""Demonstrations as Minari datasets, for other libraries to read."""
+"""Demonstrations as local Minari datasets: export with Minari, import of the plain HDF5.
+
+Minari's own reader makes the environment that a dataset's metadata names where spaces are missing,
+which runs code that a file chooses, and follows links out of the dataset. The reader here reads the
+arrays that are needed and nothing else.
+"""
 
 from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import warnings
 from collections.abc import Callable, Iterable, Iterator
@@ -12,20 +18,51 @@ from typing import Any
 from unittest.mock import patch
 
 import gymnasium
+import numpy as np
 import torch
 from torch import Tensor
 
-from giril_rl.demos.check import check_demonstration
+from giril_rl.demos.arrays import from_episodes, parse_card
 from giril_rl.demos.demonstration import Demonstration
-from giril_rl.demos.minari_read import check_name, minari_root
-from giril_rl.demos.storage import check_room
+from giril_rl.demos.storage import MOST_PACKED, check_room
 from giril_rl.errors import UserError
 from giril_rl.files.disk import temporary_sibling, write_atomically
+from giril_rl.files.untrusted import check_memory, parse_json, read_text
 
 PART_BYTES = 16 * 2**20
-"""Of a demonstration, handed to Minari at a time: what an export needs besides it."""
+"""Size of the parts of a demonstration that an export hands to Minari one after another."""
 _OVERHEAD = 4096
 """Bytes that HDF5 needs for each array of an episode, at most."""
+_NAME = re.compile(r"[-\w]+(/[-\w]+)*-v\d+", re.ASCII)
+_ARRAYS = {
+    "observations": "observations",
+    "actions": "actions",
+    "rewards": "rewards",
+    "terminated": "terminations",
+    "truncated": "truncations",
+}
+
+
+def minari_root() -> Path:
+    """The folder of local datasets: ``MINARI_DATASETS_PATH``, or Minari's default."""
+    given = os.environ.get("MINARI_DATASETS_PATH")
+    return Path(given) if given is not None else Path.home() / ".minari" / "datasets"
+
+
+def check_name(name: str) -> None:
+    """Refuses what is not a dataset's id; an id cannot lead out of the folder of datasets.
+
+    Examples:
+        >>> check_name("cartpole/expert-v0")
+        >>> check_name("../secrets-v0")
+        Traceback (most recent call last):
+        ...
+        giril_rl.errors.UserError: '../secrets-v0' is not ... such as "cartpole/expert-v0".
+    """
+    if not _NAME.fullmatch(name):
+        raise UserError(
+            f'{name!r} is not the id of a Minari dataset: it is such as "cartpole/expert-v0".'
+        )
 
 
 def to_minari(
@@ -36,21 +73,22 @@ def to_minari(
     algorithm_name: str | None = None,
     **metadata: Any,
 ) -> Any:
-    """Write a demonstration as the local Minari dataset ``dataset_id``.
+    """Writes a demonstration as the local Minari dataset ``dataset_id``.
 
-    An episode of T actions has T + 1 observations there, the terminal one included. A last episode
-    that was cut at the demonstration's length is marked as truncated, which Minari's readers expect
-    of every episode. The card is the dataset's description. The place is Minari's own, set by the
-    environment variable ``MINARI_DATASETS_PATH``. Images are written as they are, whole stacks; of
-    an Atari game the environment that Minari recovers is the bare one, without the preprocessing.
-    Of an environment that is registered by its class, not as ``"module:Class"``, only the spaces
-    are written. Memory does not grow with the demonstration: it is written in parts.
+    An episode of T actions has T + 1 observations, the terminal one included. A last episode that
+    was cut at the demonstration's length is marked as truncated, as Minari's readers expect an end
+    of every episode. The card is the dataset's description. The folder is Minari's own
+    (``MINARI_DATASETS_PATH``). Memory does not grow with the demonstration: it is written in parts.
+
+    Images are written as whole stacks. Of an Atari game, Minari recovers the bare environment
+    without the preprocessing; of an environment that is registered by its class, not as
+    ``"module:Class"``, only the spaces.
 
     Args:
         demo: what to export.
         dataset_id: such as ``"inverted_pendulum/expert-v0"``.
         make_fn: makes the environment, whose spaces and spec go into the dataset.
-        algorithm_name: what the expert is, such as ``"PPO"``.
+        algorithm_name: the expert's algorithm, such as ``"PPO"``.
         **metadata: further arguments of ``minari.create_dataset_from_buffers``, such as ``author``.
 
     Returns:
@@ -74,14 +112,14 @@ def to_minari(
             'a Minari export needs the package minari: pip install "giril-rl[minari]".'
         ) from None
     check_name(dataset_id)
-    check_demonstration(demo)
-    # Only an export is to give the cut back: to others it is a truncation.
+    demo.check()
+    # To others the cut is a truncation; our import undoes it.
     card = demo.card if demo.transitions["next", "done"][-1] else {**demo.card, "last_cut": True}
     arguments = {"algorithm_name": algorithm_name, "description": json.dumps(card), **metadata}
     root = minari_root()
     check_room(root / dataset_id, demo.transitions, more=_OVERHEAD * demo.num_episodes)
     root.mkdir(parents=True, exist_ok=True)
-    temporary = temporary_sibling(root / "export").resolve()  # Minari mistakes relative ones.
+    temporary = temporary_sibling(root / "export").resolve()  # Minari misreads relative paths.
     shutil.rmtree(temporary, ignore_errors=True)
     try:
         _write(demo, _begin(dataset_id, temporary, make_fn, arguments))
@@ -97,7 +135,7 @@ def _begin(
     make_fn: Callable[[], gymnasium.Env],
     arguments: dict[str, Any],
 ) -> Any:
-    """The storage of a dataset without episodes, beside all others."""
+    """The storage of a dataset without episodes, in a temporary folder beside the others."""
     import minari
 
     env = make_fn()
@@ -105,7 +143,7 @@ def _begin(
         if (minari_root() / dataset_id).exists():
             raise ValueError("it is there already")
         with patch.dict(os.environ, MINARI_DATASETS_PATH=str(temporary)), warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # An author's name is nobody's duty.
+            warnings.simplefilter("ignore", UserWarning)  # Of a missing author.
             return minari.create_dataset_from_buffers(
                 dataset_id, [], jpeg_encoding=False, **{**_environment(env), **arguments}
             ).storage
@@ -122,7 +160,7 @@ def _environment(env: gymnasium.Env) -> dict[str, Any]:
     spaces = {"observation_space": env.observation_space, "action_space": env.action_space}
     try:
         return {"env": env, **spaces} if env.spec is not None and env.spec.to_json() else spaces
-    except (ValueError, TypeError):  # The spec holds a class, which no text stands for.
+    except (ValueError, TypeError):  # A spec with a class cannot be written as text.
         return spaces
 
 
@@ -149,30 +187,30 @@ def _write(demo: Demonstration, storage: Any) -> None:
         return EpisodeBuffer(
             id=episode,
             seed=seeds[episode] if rows.start == ends[episode] - lengths[episode] else None,
-            observations=_array(observations),
-            actions=_array(part["action"]),
-            rewards=_array(part["next", "reward"].reshape(-1).double()),
-            terminations=_array(part["next", "terminated"].reshape(-1)),
-            truncations=_array(truncated),
+            observations=_numpy(observations),
+            actions=_numpy(part["action"]),
+            rewards=_numpy(part["next", "reward"].reshape(-1).double()),
+            terminations=_numpy(part["next", "terminated"].reshape(-1)),
+            truncations=_numpy(truncated),
         )
 
     for part in _parts(lengths, most):
         storage.update_episodes(buffer(*piece) for piece in part)
-    # Of an episode in pieces Minari counts the last one alone.
+    # Of an episode in pieces, Minari counts only the last piece.
     cut = [episode for episode, length in enumerate(lengths) if length > most]
     if cut:
         storage.update_episode_metadata([{"total_steps": lengths[i]} for i in cut], cut)
 
 
-def _array(tensor: Tensor) -> Any:
+def _numpy(tensor: Tensor) -> Any:
     return tensor.detach().cpu().numpy()
 
 
 def _parts(lengths: Iterable[int], most: int) -> Iterator[list[tuple[int, slice]]]:
-    """Pieces of episodes, their rows, in parts of at most ``most`` rows.
+    """Parts of at most ``most`` rows, each a list of episodes (or pieces of one) and their rows.
 
-    Only an episode that is longer than that is cut, from its beginning: by the size of its first
-    piece HDF5 chooses how the episode is stored.
+    Only a longer episode is cut, from its beginning: HDF5 chooses by the size of the first piece
+    how the episode is stored.
 
     Examples:
         >>> [[(i, rows.start, rows.stop) for i, rows in part] for part in _parts([2, 1, 2, 7], 3)]
@@ -193,10 +231,127 @@ def _parts(lengths: Iterable[int], most: int) -> Iterator[list[tuple[int, slice]
 
 
 def _publish(temporary: Path, root: Path, dataset_id: str) -> None:
-    """Moves a whole dataset to where Minari looks for it."""
+    """Moves a finished dataset to where Minari looks for it."""
     for part in reversed(Path(dataset_id).parents[:-1]):
         (root / part).mkdir(exist_ok=True)
         note = root / part / "namespace_metadata.json"
         if not note.exists():
             write_atomically(note, "{}")
     (temporary / dataset_id).replace(root / dataset_id)
+
+
+def read_minari(name: str, episodes: int | None = None) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Columns for :func:`~giril_rl.demos.arrays.to_transitions`, and a card of untrusted values.
+
+    Args:
+        name: the dataset's id.
+        episodes: number of episodes to read, from the first; None reads all.
+
+    Raises:
+        UserError: if h5py is missing, or the dataset is missing, damaged or of another kind.
+    """
+    check_name(name)
+    try:
+        import h5py
+    except ImportError:
+        raise UserError(
+            'a Minari import needs the package h5py: pip install "giril-rl[minari]".'
+        ) from None
+    folder = minari_root() / name / "data"
+    path = folder / "main_data.hdf5"
+    if not (folder / "metadata.json").is_file():
+        raise UserError(
+            f"there is no local Minari dataset {name}: `minari list local` shows them, "
+            "`minari download` fetches one."
+        )
+    try:
+        metadata = _metadata(folder / "metadata.json")
+        if metadata.get("data_format", "hdf5") != "hdf5" or not path.is_file():
+            raise _Fault("has no main_data.hdf5: only its HDF5 format can be read")
+        with h5py.File(path, "r") as file:
+            return _read(file, metadata, episodes)
+    except UserError:
+        raise
+    except _Fault as fault:
+        raise UserError(f"the Minari dataset {name} {fault}.") from None
+    except Exception as error:  # HDF5 raises all kinds for a damaged file.
+        reason = " ".join(str(error).split())
+        raise UserError(
+            f"the Minari dataset {name} is damaged or was cut short ({reason}): fetch it anew."
+        ) from None
+
+
+class _Fault(Exception):
+    """What is wrong with a dataset, as the end of a sentence that names it."""
+
+
+def _metadata(path: Path) -> dict[str, Any]:
+    try:
+        metadata = parse_json(read_text(path))
+    except (OSError, ValueError):
+        metadata = None
+    if not isinstance(metadata, dict):
+        raise _Fault("has damaged metadata: fetch it anew")
+    return metadata
+
+
+def _read(
+    file: Any, metadata: dict[str, Any], episodes: int | None
+) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    held, said = len(file), metadata.get("total_episodes")
+    if said != held:
+        raise _Fault(
+            f"says that it has {said} episodes and has {held}: it was cut short, fetch it anew"
+        )
+    if not held:
+        raise _Fault("is empty: at least 2 transitions are needed")
+    found, seeds = [], []
+    for number in range(held if episodes is None else min(held, episodes)):
+        group = _entry(file, f"episode_{number}")
+        found.append({ours: _array(group, theirs) for ours, theirs in _ARRAYS.items()})
+        seeds.append(group.attrs.get("seed"))
+    card = parse_card(metadata.get("description"))  # Most descriptions are prose.
+    if card.get("last_cut") is True and len(found) == held:
+        found[-1]["truncated"][-1:] = False
+    if all(isinstance(seed, np.integer) for seed in seeds):
+        card["seeds"] = [int(seed) for seed in seeds]
+    columns = from_episodes(found)
+    if card.get("rewards") is False:
+        del columns["reward"]
+    return columns, card
+
+
+def _entry(group: Any, key: str) -> Any:
+    """An entry of an HDF5 group, refused if it is a link."""
+    import h5py
+
+    if not isinstance(group, h5py.Group):
+        raise _Fault("has no episodes as Minari writes them")
+    link = group.get(key, getlink=True)
+    if link is None:
+        raise _Fault(f"has no {key}: it is damaged, fetch it anew")
+    if not isinstance(link, h5py.HardLink):
+        raise _Fault(f"has a link for {key}: only data is read")
+    return group[key]
+
+
+def _array(group: Any, key: str) -> np.ndarray:
+    import h5py
+
+    data = _entry(group, key)
+    if not isinstance(data, h5py.Dataset):
+        raise _Fault(
+            f"has {key} of several parts (a Dict or Tuple space): only vectors, images and "
+            "discrete actions are demonstrations here"
+        )
+    if data.external or data.is_virtual:
+        raise _Fault(f"has {key} in another file: only data is read")
+    if data.dtype.kind not in "fiub":
+        raise _Fault(
+            f"has {key} of {data.dtype}, not plain numbers: images that are JPEG-encoded are not "
+            "those that were seen"
+        )
+    if data.nbytes > MOST_PACKED * max(data.id.get_storage_size(), 1):
+        raise _Fault(f"has {key} larger than its file: fetch it anew")
+    check_memory(f"the Minari file {data.file.filename}", data.nbytes)
+    return np.asarray(data[()])

@@ -1,40 +1,38 @@
-"""Demonstrations as ``.npz`` files, with nothing in them but plain arrays."""
+"""Demonstrations as ``.npz`` files of plain arrays: import and export."""
 
 from __future__ import annotations
 
 import contextlib
 import json
-import math
 import zipfile
-import zlib
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from giril_rl.config.nearest import did_you_mean
-from giril_rl.demos.arrays import NEEDED, from_episodes
+from giril_rl.demos.arrays import NEEDED, check_names, from_episodes, parse_card, renamed
 from giril_rl.demos.demonstration import Demonstration
-from giril_rl.demos.names import check_names, renamed
+from giril_rl.demos.storage import BROKEN, MOST_PACKED, npy_header
 from giril_rl.errors import UserError
 from giril_rl.files.disk import sync, temporary_sibling
-from giril_rl.files.untrusted import check_memory, parse_json
+from giril_rl.files.untrusted import check_memory
 
 EPISODES = ("observations", "actions", "lengths", "terminated")
 _KNOWN = {*NEEDED, "reward", *EPISODES, "rewards", "card"}
-_BROKEN = (OSError, ValueError, EOFError, KeyError, RuntimeError, zipfile.BadZipFile, zlib.error)
-MOST_PACKED = 1100
-"""Deflate makes nothing smaller than to a 1032nd: more is a file that lies about its size."""
 
 
 def read_npz(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Columns for :func:`~giril_rl.demos.arrays.to_transitions`, and a card of untrusted values.
 
-    Either one row per transition: ``observation``, ``action``, ``next_observation``,
-    ``terminated`` and ``truncated`` [N, ...], ``reward`` if known. Or whole episodes one after
-    another: ``observations`` [N + E, ...], T + 1 rows for an episode of T actions, ``actions``
-    [N, ...], ``lengths`` int [E], ``terminated`` bool [E] (the others ended at a time limit),
-    ``rewards`` [N] if known. Nothing is unpickled, and nothing read before its size is known.
+    Nothing is unpickled, and nothing is read before its size is known. The file has one of two
+    forms.
+
+    - One row per transition: ``observation``, ``action``, ``next_observation``, ``terminated`` and
+      ``truncated`` [N, ...], ``reward`` if known.
+    - Whole episodes, concatenated: ``observations`` [N + E, ...], T + 1 rows for an episode of T
+      actions, ``actions`` [N, ...], ``lengths`` int [E], ``terminated`` bool [E] (the other
+      episodes ended at a time limit), ``rewards`` [N] if known.
 
     Raises:
         UserError: for a file that is damaged, or holds anything else.
@@ -54,23 +52,23 @@ def read_npz(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
             names = _names(archive)
             check_memory(path.name, sum(member.file_size for member in archive.infolist()))
             arrays = {name: _array(archive, name) for name in names}
-    except _BROKEN as error:
+    except BROKEN as error:
         raise UserError(
             f"{path.name} is no .npz file, or was cut short ({error}): write it anew."
         ) from None
-    card = _card(arrays.pop("card", None))
-    return (_whole(arrays) if "lengths" in arrays else arrays), card
+    card = arrays.pop("card", np.empty(0))
+    return (_whole(arrays) if "lengths" in arrays else arrays), parse_card(card.tobytes())
 
 
 def to_npz(demo: Demonstration, path: Path | str) -> None:
-    """Write a demonstration, one row per transition, such that the import gives the same bits back.
+    """Writes a demonstration, one row per transition; an import gives the same bits back.
 
     Args:
         demo: what to export; unknown rewards are left out.
-        path: the file, ending in ``.npz``.
+        path: a new file, ending in ``.npz``.
 
     Raises:
-        UserError: if the file is there already, or is named otherwise.
+        UserError: if the file exists, or its name ends otherwise.
 
     Examples:
         >>> demo = Demonstration.load("runs/demos/cartpole/0a1b")  # doctest: +SKIP
@@ -120,7 +118,7 @@ def _names(archive: zipfile.ZipFile) -> list[str]:
 
 
 def _check_names(names: list[str]) -> None:
-    """Refuses a file with names of neither kind, or without some of the kind that it is."""
+    """Refuses names of neither form, and a form that is not complete."""
 
     def likeness(form: tuple[str, ...]) -> tuple[int, int]:
         same = len(set(form) & set(names))
@@ -139,35 +137,20 @@ def _check_names(names: list[str]) -> None:
 
 def _array(archive: zipfile.ZipFile, name: str) -> np.ndarray:
     member = archive.getinfo(f"{name}.npy")
-    with archive.open(member) as file:
-        version = np.lib.format.read_magic(file)
-        if version not in ((1, 0), (2, 0)):
-            raise UserError(f"{name} in the .npz file has another format: save it with numpy anew.")
-        first = version == (1, 0)
-        read = np.lib.format.read_array_header_1_0 if first else np.lib.format.read_array_header_2_0
-        shape, _, dtype = read(file)
-        if dtype.hasobject or dtype.kind not in "fiub":
-            raise UserError(
-                f"{name} in the .npz file is of {dtype}, not plain numbers: nothing is unpickled, "
-                "so save arrays of numbers."
-            )
-        size = file.tell() + math.prod(shape) * dtype.itemsize
+    _, dtype, _, size = npy_header(archive, name)
+    if dtype.hasobject or dtype.kind not in "fiub":
+        raise UserError(
+            f"{name} in the .npz file is of {dtype}, not plain numbers: nothing is unpickled, so "
+            "save arrays of numbers."
+        )
     if member.file_size != size or size > MOST_PACKED * max(member.compress_size, 1):
         raise ValueError(f"{name} has not the size that it says")
     with archive.open(member) as file:
         return np.lib.format.read_array(file, allow_pickle=False)
 
 
-def _card(array: np.ndarray | None) -> dict[str, Any]:
-    """The card of an export; what others call so is worth nothing here."""
-    try:
-        card = parse_json(array.tobytes()) if array is not None else {}
-    except ValueError:
-        card = {}
-    return card if isinstance(card, dict) else {}
-
-
 def _whole(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Columns of a file of whole episodes."""
     foreign = sorted(set(arrays) - {*EPISODES, "rewards"})
     if foreign:
         raise UserError(

@@ -1,4 +1,4 @@
-"""A game played by hand, recorded as an expert's is."""
+"""Play a game by hand, and record it as an expert's demonstration."""
 
 from __future__ import annotations
 
@@ -14,30 +14,34 @@ from torch import Tensor
 
 from giril_rl.demos.demonstration import Demonstration
 from giril_rl.demos.record import record_demonstration
+from giril_rl.envs.gym_api import env_name
 from giril_rl.errors import UserError
 
 KEYS = {"up": "UP", "down": "DOWN", "left": "LEFT", "right": "RIGHT", "fire": "SPACE"}
-"""What is asked for, and pygame's name of the key for it."""
+"""Directions and the button, with pygame's names of their keys."""
 SCALE = 6
 FPS = 15
 """An action lasts four of a game's sixty frames a second."""
 
 
 class Screen(Protocol):
-    """Where a game is seen, and the keys that are held down there."""
+    """Shows a game and reads the keyboard."""
 
     def show(self, frame: np.ndarray) -> frozenset[str] | None:
-        """Draws a grey frame, uint8 [h, w], and waits a moment; keys of KEYS, None if closed."""
+        """Draws a grey frame, uint8 [h, w], and waits for the next; the keys of KEYS held down.
+
+        None if the window was closed.
+        """
 
     def close(self) -> None:
         """Ends the window."""
 
 
 def action_of(keys: frozenset[str], meanings: list[str]) -> int:
-    """The action that some keys ask for, of a game with these actions.
+    """The action for some keys, in a game whose actions have these names (by ale-py).
 
-    Opposite keys cancel out. Where a game has no action for all keys together, the one for most of
-    them is taken, sideways before up and down. ``meanings`` are the actions' names by ale-py.
+    Opposite keys cancel out. If no action fits all keys together, the one that fits most is taken,
+    sideways before up and down.
 
     Examples:
         >>> names = ["NOOP", "FIRE", "RIGHT", "LEFT", "RIGHTFIRE"]
@@ -66,18 +70,17 @@ def play_demonstration(
     task: str | None = None,
     lives: str | None = None,
 ) -> Demonstration:
-    """Record what a player does, whole episodes, checked and replayed as any recording is.
+    """Records whole episodes of a human player, checked and replayed as any recording.
 
-    The player sees what a policy would: the latest frame. Each action is what is held down after
-    that frame was shown.
+    The player sees the latest frame, and plays the keys held down while it is shown.
 
     Args:
         make_fn: makes a game with images and ``get_action_meanings``.
-        screen: shows frames and tells keys; closed at the end.
-        episodes: how many.
+        screen: shows frames and reads keys; closed at the end.
+        episodes: number of episodes.
         seed: root of the episodes' seeds.
-        task: the task's name, for the card, as ``lives``.
-        lives: "first" or "all".
+        task: the task's name, for the card.
+        lives: "first" or "all", for the card.
 
     Raises:
         UserError: if the window is closed before all episodes are over; nothing is kept then.
@@ -86,8 +89,14 @@ def play_demonstration(
         >>> play_demonstration(make_fn, Window("pong"), episodes=1, seed=0)  # doctest: +SKIP
     """
     env = make_fn()
-    meanings = env.unwrapped.get_action_meanings()  # type: ignore[attr-defined]
+    named = getattr(env.unwrapped, "get_action_meanings", None)
+    meanings = named() if named is not None else []
     env.close()
+    if not meanings:
+        raise UserError(
+            f"{env_name(env)} does not name its actions (get_action_meanings): it cannot be played "
+            "by hand."
+        )
 
     def choose(observation: Tensor) -> Tensor:
         keys = screen.show(observation[0, -1].numpy())
@@ -106,7 +115,11 @@ def play_demonstration(
 
 
 class Window:
-    """A :class:`Screen` by pygame, refused without it or a display: arrows, space, Escape."""
+    """A :class:`Screen` by pygame: arrows, space, Escape to leave.
+
+    Raises:
+        UserError: without pygame or a display.
+    """
 
     def __init__(self, title: str) -> None:
         try:
@@ -130,7 +143,9 @@ class Window:
 
     def show(self, frame: np.ndarray) -> frozenset[str] | None:
         """See :class:`Screen`."""
-        colours = np.repeat(frame.T[:, :, None], 3, axis=2)  # pygame's first dimension is across.
+        colours = np.repeat(
+            frame.T[:, :, None], 3, axis=2
+        )  # pygame's first dimension is the width.
         surface = self._game.surfarray.make_surface(colours)
         self._game.transform.scale(surface, self._window.get_size(), self._window)
         self._game.display.flip()

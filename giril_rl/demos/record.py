@@ -1,7 +1,8 @@
-"""Watch a policy play, and keep what it saw and did in step."""
+"""Records a policy's episodes, then checks and replays them."""
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable
 from itertools import count
 from typing import Any
@@ -9,31 +10,30 @@ from typing import Any
 import gymnasium
 import numpy as np
 import torch
-from tensordict import TensorDict
 from torch import Tensor
 
-from giril_rl.demos.check import check_demonstration
+from giril_rl.demos.arrays import to_transitions
 from giril_rl.demos.demonstration import Demonstration
-from giril_rl.demos.distinct import DistinctEpisodes
 from giril_rl.demos.replay import as_executed, as_recorded, verify_by_replay
-from giril_rl.envs.checking import check_reset, check_step, env_name
-from giril_rl.envs.spaces import check_action_space
-from giril_rl.envs.stdout import silent_stdout
+from giril_rl.envs.gym_api import (
+    check_action_space,
+    check_reset,
+    check_step,
+    env_name,
+    silent_stdout,
+)
 from giril_rl.errors import UserError
-from giril_rl.files.disk import installed_versions, processor
+from giril_rl.runs.machine import installed_versions, processor
 from giril_rl.runs.progress import progress
 from giril_rl.runs.randomness import seeded, stream_seed
 
+TRIES = 30
+"""Episodes in a row that may repeat earlier ones: an Atari game has as many beginnings."""
 _LONGEST_EPISODE = 1_000_000
 
 
 def episode_seed(seed: int, episode: int) -> int:
-    """The reset seed of one episode: distinct for all episodes of all root seeds, in practice.
-
-    Examples:
-        >>> len({episode_seed(seed, episode) for seed in range(3) for episode in range(100)})
-        300
-    """
+    """The reset seed of one episode of a recording."""
     return stream_seed("demonstration", seed, episode, bits=32)
 
 
@@ -50,22 +50,21 @@ def record_demonstration(
     lives: str | None = None,
     show_progress: bool = True,
 ) -> Demonstration:
-    """Record transitions as they were, then prove them by check and by replay.
+    """Records a policy's transitions, then proves them by check and by replay.
 
-    Every episode has a seed of its own. Where another seed makes no other episode, as for a
-    deterministic policy in a game that has few beginnings, of whole episodes only those are kept
-    that repeat none before. Actions are stored as executed: clipped to the bounds of a Box.
-    Torch's generator is seeded for the recording and put back, so a sampled policy repeats as well.
+    Every episode has its own seed. Of whole episodes, those that repeat an earlier one are dropped:
+    a deterministic policy in a game with few beginnings often repeats itself. Actions are stored as
+    executed, clipped to the bounds of a Box. Torch's generator is seeded for the recording and then
+    restored, so that a sampled policy repeats as well.
 
     Args:
         make_fn: makes the Gymnasium environment: flat observation or uint8 images [c, h, w], Box
             or Discrete actions, as :class:`~giril_rl.envs.GymVectorEnv` takes them.
         policy: observation float32 [1, d], or uint8 [1, c, h, w], -> action float [1, a] (Box) or
-            int64 [1] (Discrete); it returns is played, so it decides itself between mean and
-            sample.
+            int64 [1] (Discrete), played as returned: the policy chooses between mean and sample.
         seed: root of the episodes' seeds.
-        length: number of transitions; the last episode is cut where it is reached.
-        episodes: number of whole episodes, instead of ``length``, no two of them the same.
+        length: number of transitions; it cuts the last episode.
+        episodes: number of whole, distinct episodes, instead of ``length``.
         deterministic: how ``policy`` chooses, for the card.
         task: the task's name, for the card.
         expert: score and source of the policy, for the card; plain JSON values.
@@ -73,16 +72,15 @@ def record_demonstration(
         show_progress: show a progress bar.
 
     Returns:
-        The demonstration; its card has ``task``, ``env_id``, ``seed``, ``seeds``, ``length``,
+        The demonstration. Its card has ``task``, ``env_id``, ``seed``, ``seeds``, ``length``,
         ``deterministic``, ``expert``, ``versions``, ``processor``, ``transitions`` and
-        ``episode_returns``, a
-        game's also ``lives``, ``lives_left`` (at each episode's beginning and end) and ``actions``,
-        their names.
+        ``episode_returns``; a game's also ``lives``, ``lives_left`` (at each episode's beginning
+        and end) and ``actions``, their names.
 
     Raises:
         UserError: unless exactly one of ``length`` and ``episodes`` is positive; for an action that
-            is not finite or not in the space; for an environment that does not repeat, or whose
-            spaces, observations or rewards are not what they should be.
+            is not finite or not in the space; for an environment that does not repeat itself, or
+            whose spaces, observations or rewards are wrong.
 
     Examples:
         >>> demo = record_demonstration(
@@ -99,10 +97,10 @@ def record_demonstration(
         )
     env = make_fn()
     check_action_space(env.action_space, env_name(env))
-    parts: list[TensorDict] = []
+    parts: list[dict[str, np.ndarray]] = []
     seeds: list[int] = []
     lives_left: list[list[int]] = []
-    distinct, numbers = DistinctEpisodes(episodes or 0), count()
+    distinct, numbers = _Distinct(episodes or 0), count()
     total, unit = (length, "steps") if length is not None else (episodes, "episodes")
     try:
         with (
@@ -110,24 +108,25 @@ def record_demonstration(
             torch.no_grad(),
             progress(total or 0, desc="demonstration", unit=unit, disable=not show_progress) as bar,
         ):
-            while bar.done < (total or 0):
+            while bar.n < (total or 0):
                 own = episode_seed(seed, next(numbers))
-                most = _LONGEST_EPISODE if length is None else length - bar.done
+                most = _LONGEST_EPISODE if length is None else length - bar.n
                 played, counted = _play(env, policy, own, most)
-                if length is None and not played[-1]["done"]:
+                if length is None and not (played[-1]["terminated"] or played[-1]["truncated"]):
                     raise UserError(
                         f"an episode did not end within {most:,} steps: give the task a "
                         "max_episode_steps, or set demo.length."
                     )
-                if length is None and not distinct.add(played):
+                if length is None and not distinct.is_new(played):
                     continue
                 seeds.append(own)
                 lives_left.append(counted)
-                parts.append(_stack(played, len(parts)))
+                parts.append(_columns(played, len(parts)))
                 bar.update(1 if length is None else len(played))
     finally:
         env.close()
-    demo = Demonstration(TensorDict.cat(parts))
+    columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    demo = Demonstration(to_transitions(columns))
     demo.card = {
         "task": task,
         "env_id": env.spec.id if env.spec is not None else None,
@@ -148,7 +147,7 @@ def record_demonstration(
     meanings = getattr(env.unwrapped, "get_action_meanings", None)  # As ale-py calls it.
     if meanings is not None:
         demo.card["actions"] = list(meanings())
-    check_demonstration(demo)
+    demo.check()
     verify_by_replay(demo, make_fn)
     return demo
 
@@ -158,7 +157,7 @@ def _play(
 ) -> tuple[list[dict[str, Any]], list[int]]:
     """One episode from ``seed``, or its first ``most`` transitions, and lives before and after."""
     rows: list[dict[str, Any]] = []
-    with silent_stdout():  # the simulator connects here
+    with silent_stdout():  # Simulators connect here, and may print.
         observation, info = check_reset(env, env.reset(seed=seed))
     lives = [info.get("lives")]
     before = as_recorded(observation)
@@ -172,11 +171,10 @@ def _play(
             {
                 "observation": before,
                 "action": action,
-                "next": after,
+                "next_observation": after,
                 "reward": float(reward),
                 "terminated": bool(terminated),
                 "truncated": bool(truncated),
-                "done": bool(terminated or truncated),
             }
         )
         before = after
@@ -206,22 +204,35 @@ def _choose(
     return int(output)
 
 
-def _stack(rows: list[dict[str, Any]], episode: int) -> TensorDict:
-    def column(name: str, dtype: torch.dtype | None = None) -> Tensor:
-        return torch.as_tensor(np.stack([row[name] for row in rows]), dtype=dtype)
+def _columns(rows: list[dict[str, Any]], episode: int) -> dict[str, np.ndarray]:
+    """The columns of one episode, see :func:`~giril_rl.demos.arrays.to_transitions`."""
+    columns = {name: np.stack([row[name] for row in rows]) for name in rows[0]}
+    return {**columns, "episode": np.full(len(rows), episode), "step": np.arange(len(rows))}
 
-    discrete = isinstance(rows[0]["action"], int)
-    after = {"observation": column("next")}
-    after["reward"] = column("reward", torch.float32).unsqueeze(-1)
-    for name in ("done", "terminated", "truncated"):
-        after[name] = column(name, torch.bool).unsqueeze(-1)
-    return TensorDict(
-        {
-            "observation": column("observation"),
-            "action": column("action", torch.int64 if discrete else torch.float32),
-            "episode": torch.full((len(rows),), episode),
-            "step": torch.arange(len(rows)),
-            "next": TensorDict(after, [len(rows)]),
-        },
-        [len(rows)],
-    )
+
+class _Distinct:
+    """Tells which episodes repeat an earlier one, and gives up after :data:`TRIES` in a row."""
+
+    def __init__(self, wanted: int) -> None:
+        self._wanted = wanted
+        self._known: set[bytes] = set()
+        self._repeats = 0
+
+    def is_new(self, played: list[dict[str, Any]]) -> bool:
+        content = hashlib.blake2b(played[0]["observation"].tobytes())
+        for row in played:
+            content.update(np.asarray(row["action"]).tobytes())
+            content.update(row["next_observation"].tobytes())
+        if content.digest() not in self._known:
+            self._known.add(content.digest())
+            self._repeats = 0
+            return True
+        self._repeats += 1
+        if self._repeats == TRIES:
+            found = len(self._known)
+            raise UserError(
+                f"demo.episodes={self._wanted}: only {found} different ones were found, the last "
+                f"{TRIES} repeat them; set demo.episodes={found}, or demo.deterministic=false, "
+                "which samples the player's actions."
+            )
+        return False

@@ -1,42 +1,28 @@
-"""The proof that recorded actions belong to their states: play them again."""
+"""Replays a demonstration, to prove that its actions belong to their states."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 import gymnasium
 import numpy as np
 
-from giril_rl.envs.stdout import silent_stdout
+from giril_rl.demos.demonstration import Demonstration
+from giril_rl.envs.gym_api import silent_stdout
 from giril_rl.errors import UserError
-
-if TYPE_CHECKING:
-    from giril_rl.demos.demonstration import Demonstration
 
 
 def as_executed(action: np.ndarray | int, space: gymnasium.Space) -> np.ndarray | int:
-    """A recorded action in the form that ``space``'s environment steps with.
-
-    Examples:
-        >>> as_executed(np.array([0.5], dtype=np.float32), gymnasium.spaces.Box(-1, 1, (1,)))
-        array([0.5], dtype=float32)
-    """
+    """A recorded action in the form that ``space``'s environment steps with."""
     if isinstance(space, gymnasium.spaces.Box):
         return np.asarray(action, dtype=space.dtype).reshape(space.shape)
     return int(action)
 
 
 def as_recorded(observation: object) -> np.ndarray:
-    """A copy of an environment's observation, since some reuse one array for all steps.
+    """A copy of an observation, since some environments reuse one array for all steps.
 
-    Images, uint8 in three dimensions, stay what they are; all else becomes float32 [d].
-
-    Examples:
-        >>> as_recorded(np.zeros((2, 2), dtype=np.uint8)).dtype
-        dtype('float32')
-        >>> as_recorded(np.zeros((4, 84, 84), dtype=np.uint8)).shape
-        (4, 84, 84)
+    Images, uint8 of three dimensions, keep their type and shape; all else becomes float32 [d].
     """
     array = np.asarray(observation)
     if array.dtype == np.uint8 and array.ndim == 3:
@@ -47,10 +33,9 @@ def as_recorded(observation: object) -> np.ndarray:
 def verify_by_replay(
     demo: Demonstration, make_fn: Callable[[], gymnasium.Env], *, tolerance: float = 0.0
 ) -> None:
-    """Play each episode's actions from its seed in a fresh environment and compare all it shows.
+    """Plays each episode's actions from its seed in a fresh environment and compares everything.
 
-    An action stored one step early or late leads elsewhere and is caught, which no look at the
-    data alone can do.
+    This catches actions stored one step early or late, which the data alone cannot show.
 
     Args:
         demo: a demonstration with ``card["seeds"]``.
@@ -59,10 +44,10 @@ def verify_by_replay(
             bits, which a deterministic simulator gives on the same machine.
 
     Raises:
-        UserError: at the first transition that differs, or whose action there is none of.
+        UserError: at the first transition that differs, or whose action does not exist.
 
     Examples:
-        >>> from giril_rl.demos import Demonstration, record_demonstration
+        >>> from giril_rl.demos import record_demonstration
         >>> make_fn = lambda: gymnasium.make("CartPole-v1")
         >>> balance = lambda observation: (observation[:, 2] + observation[:, 3] > 0).long()
         >>> demo = record_demonstration(make_fn, balance, length=50, seed=0)
@@ -90,7 +75,7 @@ def verify_by_replay(
     for seed, length in zip(seeds, demo.lengths.tolist(), strict=True):
         env = make_fn()
         try:
-            with silent_stdout():  # the simulator connects here
+            with silent_stdout():  # Simulators connect here, and may print.
                 observation, _ = env.reset(seed=int(seed))
             _compare(
                 "reset", index, data["observation"][index], as_recorded(observation), tolerance
@@ -107,7 +92,7 @@ def verify_by_replay(
 
 
 def _check_action(action: np.ndarray | int, space: gymnasium.Space, index: int) -> None:
-    """A real action may leave its bounds, which are clamped; an integer that is no action not."""
+    """Refuses an integer that is not an action; real ones outside their bounds are clamped."""
     if isinstance(space, gymnasium.spaces.Discrete) and not space.contains(action):
         raise UserError(
             f"the demonstration has the action {action} at index {index}, and the environment has "

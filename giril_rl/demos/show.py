@@ -1,18 +1,29 @@
-"""What a demonstration holds, as text."""
+"""A demonstration shown: as text, and images as an animated GIF."""
 
 from __future__ import annotations
 
-from giril_rl.demos.demonstration import Demonstration
+import io
+from collections.abc import Iterator
+from itertools import chain, pairwise
+from pathlib import Path
 
+from PIL import Image
+from torch import Tensor
+
+from giril_rl.demos.demonstration import Demonstration
+from giril_rl.errors import UserError
+from giril_rl.files.disk import write_atomically
+
+SCALE = 4
 _LIVES = {"first": ", each up to the first lost life", "all": ", each through all lives"}
 _PLAYED = {"True": "deterministic", "False": "sampled", "by hand": "by hand"}
 
 
 def describe(demo: Demonstration) -> str:
-    """A table of a demonstration: where it comes from, what was done, how each episode went.
+    """A table of a demonstration's origin, actions and episodes.
 
     Args:
-        demo: what to look at; its card may lack anything.
+        demo: the demonstration; its card may lack anything.
 
     Examples:
         >>> import gymnasium
@@ -109,7 +120,7 @@ def _episodes(demo: Demonstration) -> list[str]:
 
 
 def _lives_left(demo: Demonstration) -> list[list[int]] | None:
-    """Lives at each episode's beginning and end, if the card has them; it may lie."""
+    """Lives at each episode's beginning and end, if the card has them in the right form."""
     found = demo.card.get("lives_left")
     if not isinstance(found, list) or len(found) != demo.num_episodes:
         return None
@@ -121,10 +132,59 @@ def _lives_left(demo: Demonstration) -> list[list[int]] | None:
 
 
 def _ended(demo: Demonstration, lives: list[int] | None) -> str:
-    """Some games have no lives, and their first is as long as the game."""
+    """Why an episode terminated; in a game without lives, "first" is the whole game."""
     kind = demo.card.get("lives")
     if kind not in ("first", "all"):
         return "terminated"
     if lives is not None:
         return "life lost" if kind == "first" and lives[1] > 0 else "game over"
     return "life lost" if kind == "first" else "game over"
+
+
+def write_gif(demo: Demonstration, path: Path, fps: int = 15) -> None:
+    """Writes every frame of every episode, terminal ones included.
+
+    Args:
+        demo: a demonstration of images; the last plane of a stack is the latest.
+        path: the file, replaced if it exists.
+        fps: frames per second; 15 is an Atari game's own speed, as an action lasts 4 of 60 frames.
+
+    Raises:
+        UserError: if the observations are vectors.
+
+    Examples:
+        >>> demo = Demonstration.load("runs/demos/breakout/0a1b")  # doctest: +SKIP
+        >>> write_gif(demo, Path("breakout.gif"))  # doctest: +SKIP
+    """
+    if not demo.has_images:
+        raise UserError(
+            f"--out {path}: this demonstration's observations are vectors, of which there is no "
+            "picture."
+        )
+    planes = list(_planes(demo))
+    frames = map(_picture, planes)
+    # GIF counts in hundredths of a second: durations differ by one so that their sum is right.
+    ends = [round(100 * number / fps) for number in range(len(planes) + 1)]
+    content = io.BytesIO()
+    next(frames).save(
+        content,
+        format="GIF",
+        save_all=True,
+        append_images=frames,
+        duration=[10 * (end - start) for start, end in pairwise(ends)],
+        loop=0,
+    )
+    write_atomically(path, content.getvalue())
+
+
+def _planes(demo: Demonstration) -> Iterator[Tensor]:
+    data = demo.transitions
+    starts = data["step"] == 0
+    for row, after in enumerate(data["next", "observation"]):
+        first = [data["observation"][row]] if starts[row] else []
+        yield from (stack[-1] for stack in chain(first, [after]))
+
+
+def _picture(plane: Tensor) -> Image.Image:
+    picture = Image.fromarray(plane.numpy())
+    return picture.resize((SCALE * picture.width, SCALE * picture.height), Image.Resampling.NEAREST)

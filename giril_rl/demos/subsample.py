@@ -1,4 +1,4 @@
-"""A fixed part of a demonstration to learn from, and the rest to test on."""
+"""Training and validation parts of a demonstration."""
 
 from __future__ import annotations
 
@@ -10,18 +10,17 @@ from giril_rl.errors import UserError
 
 
 def subsample(demo: Demonstration, every: int, offset: int = 0) -> TensorDict:
-    """Each ``every``-th transition, counted across episodes, the same ones every time.
+    """Each ``every``-th transition, counted across episodes: ``ceil((N - offset) / every)`` of N.
 
     The paper's continuous control tasks keep one transition in 20 of 1,000 steps: 50 pairs.
-    Episodes are not restarted, so that N transitions always give ``ceil((N - offset) / every)``.
 
     Args:
-        demo: the demonstration, which is left as it is.
+        demo: the demonstration; not changed.
         every: keep 1 in this many; 1 keeps all.
         offset: index of the first one kept, below ``every``.
 
     Raises:
-        UserError: if that is no positive number, or nothing would be left.
+        UserError: if these are out of range, or nothing would be left.
 
     Examples:
         >>> data = TensorDict({"step": torch.arange(10)}, [10])
@@ -34,16 +33,7 @@ def subsample(demo: Demonstration, every: int, offset: int = 0) -> TensorDict:
 
 
 def holdout(demo: Demonstration, every: int, offset: int = 0) -> TensorDict:
-    """The transitions that :func:`subsample` leaves out; none for ``every=1``.
-
-    Args:
-        demo: the demonstration.
-        every: as for :func:`subsample`.
-        offset: as for :func:`subsample`.
-
-    Raises:
-        UserError: as :func:`subsample`.
-    """
+    """The transitions that :func:`subsample` leaves out, none for ``every=1``; for validation."""
     return demo.transitions[~_kept(demo, every, offset)]
 
 

@@ -1,4 +1,4 @@
-"""Atari games as one TorchRL environment, whose episodes are lives or whole games."""
+"""Atari games as one TorchRL environment: frame stacks, and lives or whole games as episodes."""
 
 from __future__ import annotations
 
@@ -10,11 +10,10 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Bounded, Categorical
 
-from giril_rl.envs.atari_game import FRAME_CAP, NOOP, SIDE, SKIP, AtariGame, Shown
-from giril_rl.envs.batched import BatchedEnv
-from giril_rl.envs.saved import (
+from giril_rl.envs.atari_preprocessing import FRAME_CAP, NOOP, SIDE, SKIP, AtariGame, Shown
+from giril_rl.envs.batched import (
+    BatchedEnv,
     check_counts,
-    check_game_actions,
     saved_array,
     saved_seed,
     saved_tensor,
@@ -26,11 +25,11 @@ Episode = Literal["life", "game"]
 
 STACK = 4
 RESEED_EVERY = 64
-"""Games that one seed is for: seeding takes ten times as long as the rest of a reset."""
+"""Games per seed: seeding takes ten times as long as the rest of a reset."""
 
 
 class Opened(NamedTuple):
-    """What the steps that begin lives did, for each game."""
+    """What the opening steps of lives did, for each game."""
 
     scored: np.ndarray
     over: np.ndarray
@@ -38,32 +37,32 @@ class Opened(NamedTuple):
 
 
 class AtariEnv(BatchedEnv):
-    """``num_envs`` games of DeepMind's preprocessing, see :class:`AtariGame`, four frames stacked.
+    """``num_envs`` Atari games with DeepMind's preprocessing and four stacked frames.
 
-    With ``episode="life"`` a lost life ends the learner's episode (``terminated``) and the game
-    goes on from there; ``("next", "observation")`` is then the last stack of that life. With
-    ``episode="game"`` only the game's end does, as scores are counted; where a life is lost in the
-    middle, ``("next", "observation")`` is the first of the next life.
+    :class:`~giril_rl.envs.atari_preprocessing.AtariGame` makes the frames. Observations are uint8
+    ``(num_envs, 4, 84, 84)``, the latest frame last; actions are integers.
 
-    A life begins, as with the wrappers of OpenAI baselines, with a step without action (but for a
+    With ``episode="life"`` a lost life ends the episode (``terminated``) and the game continues;
+    ``("next", "observation")`` is then the last stack of that life. With ``episode="game"``, as
+    scores are counted, only the game's end does; where a life is lost in the middle,
+    ``("next", "observation")`` is the first stack of the next life. In either mode
+    ``("next", "game_over")`` marks the end of a game, ``("next", "life_over")`` that of a life.
+
+    A life begins as in the wrappers of OpenAI baselines: with a step without action (except a
     game's first life) and, in games that have the button, the actions 1 (fire) and 2. The stack is
-    then empty, black, but for the latest frame. What these steps score counts in whole games, but
-    for a game's first opening; to the learner of single lives it is lost.
+    then black but for the latest frame. Rewards during an opening count in the game's score (except
+    the first opening's) but are not shown to the learner of single lives.
 
-    Observations are uint8 ``(num_envs, 4, 84, 84)``, the latest frame last; actions are integers.
-    ``("next", "game_over")`` tells the end of a game, ``("next", "life_over")`` that of a life, in
-    either mode.
-
-    Each of the ``num_envs`` is seeded anew at every 64th game; games differ in the number of frames
-    without action that they begin with.
+    Each emulator is seeded at every 64th game. Games differ in how many frames without action
+    they begin with.
 
     Args:
         game: the ROM's name in ale-py, such as ``"breakout"``.
         num_envs: number of games.
         episode: "life" or "game".
         seed: root of the games' seeds.
-        use: what the episodes are for; those of two uses never have equal seeds.
-        frame_cap: emulated frames after which a game is cut (truncated).
+        use: what the episodes are for; two uses never share seeds.
+        frame_cap: emulated frames after which a game is truncated.
 
     Raises:
         UserError: if ale-py is not installed or has no such game.
@@ -95,7 +94,7 @@ class AtariEnv(BatchedEnv):
         self._lives_end = episode == "life"
         self._opening = [1, 2] if self._games[0].fires else []
         self._lives = np.zeros(num_envs, dtype=np.int64)
-        self._between = np.zeros(num_envs, dtype=bool)  # A life was lost and the game goes on.
+        self._between = np.zeros(num_envs, dtype=bool)  # A life was lost and the game continues.
         self._actions: list[list[int]] = [[] for _ in range(num_envs)]  # Since a game's reset.
         self._last_observation = np.zeros((num_envs, STACK, SIDE, SIDE), dtype=np.uint8)
         shape = (num_envs, STACK, SIDE, SIDE)
@@ -128,7 +127,7 @@ class AtariEnv(BatchedEnv):
         over = np.array([game.over for game in shown])
         cut = np.array([game.cut for game in shown]) & ~over
         lives = np.array([game.lives for game in shown], dtype=np.int64)
-        # In some games a lost last life shows before the game is over (Qbert).
+        # In some games (Qbert) the last life is lost some steps before the game is over.
         lost = self._between = (lives < self._lives) & (lives > 0) & ~over & ~cut
         self._lives = lives
         terminated = over | self._between if self._lives_end else over
@@ -165,7 +164,7 @@ class AtariEnv(BatchedEnv):
     def _reset_where(self, mask: np.ndarray) -> np.ndarray:
         opened = self._begin_lives(np.flatnonzero(mask & self._between).tolist())
         fresh = mask & ~self._between | opened.over | opened.cut
-        while fresh.any():  # The opening of a game may end it, if hardly ever.
+        while fresh.any():  # An opening may end its game, though hardly ever.
             opened = self._begin_games(np.flatnonzero(fresh).tolist())
             fresh = opened.over | opened.cut
         self._between[mask] = False
@@ -190,7 +189,7 @@ class AtariEnv(BatchedEnv):
     def _open(
         self, indices: list[int], actions: list[int], frames: dict[int, np.ndarray]
     ) -> Opened:
-        """Plays ``actions`` in some games and clears their stacks."""
+        """Plays ``actions`` in some games, then clears their stacks but for the latest frame."""
         scored = np.zeros(len(self._games), dtype=np.float32)
         over, cut = (np.zeros(len(self._games), dtype=bool) for _ in range(2))
         playing = list(indices)
@@ -200,7 +199,7 @@ class AtariEnv(BatchedEnv):
                 scored[i] += shown.reward
                 over[i], cut[i] = shown.over, shown.cut and not shown.over
             playing = [i for i in playing if not (over[i] or cut[i])]
-        # What was handed out before stays as it is: a batch may hold it.
+        # A batch may still hold the observations returned before.
         self._last_observation = self._last_observation.copy()
         self._last_observation[indices] = 0
         for i in indices:
@@ -212,11 +211,11 @@ class AtariEnv(BatchedEnv):
         self._between[:] = False
 
     def simulator_state(self) -> dict[str, Any]:
-        """What :meth:`restore_simulator` needs to bring another instance to this very moment.
+        """See :meth:`BatchedEnv.simulator_state`.
 
         Returns:
-            Tensors only: the games' numbers, the actions since each game began, int16 ``(num_envs,
-            longest)`` with -1 after the last, and what the learner sees.
+            Tensors and the seed: the games' numbers, the actions since each game began, int16
+            ``(num_envs, longest)`` with -1 after the last, lives and observations.
         """
         longest = max(len(actions) for actions in self._actions)
         actions = np.full((len(self._games), longest), -1, dtype=np.int16)
@@ -232,17 +231,9 @@ class AtariEnv(BatchedEnv):
         }
 
     def restore_simulator(self, state: dict[str, Any]) -> bool:
-        """Replays the running games; the next :meth:`reset` hands out where they stand.
+        """See :meth:`BatchedEnv.restore_simulator`.
 
-        Args:
-            state: what :meth:`simulator_state` returned for an equal environment.
-
-        Returns:
-            Whether the replay came to the same moment. If not, ale-py, or the giril_rl that saved
-            the state, is another version, and all games begin anew.
-
-        Raises:
-            ValueError: if it is no state of such an environment; nothing is played then.
+        A replay fails where another version of ale-py or giril_rl saved the state.
         """
         seed = saved_seed(state)
         episode = saved_array(state, "episode", self._episode)
@@ -251,7 +242,7 @@ class AtariEnv(BatchedEnv):
         observation = saved_array(state, "observation", self._last_observation)
         actions = saved_tensor(state, "actions")
         check_counts("episode", episode, 1)
-        check_game_actions(actions, len(self._games), len(self.meanings), self._longest)
+        _check_actions(actions, len(self._games), len(self.meanings), self._longest)
         self._root_seed, self._episode, self._between = seed, episode, between
         self._lives, self._last_observation = saved_lives, observation
         self._restored = True
@@ -262,7 +253,7 @@ class AtariEnv(BatchedEnv):
         return False
 
     def _replay(self, actions: np.ndarray) -> bool:
-        """Whether the running games, played again, show what was saved."""
+        """Whether the running games, replayed, show the saved frames and lives."""
         frames, lives = np.zeros_like(self._last_observation[:, -1]), np.zeros_like(self._lives)
         over = np.zeros_like(self._between)
         for i, begun in enumerate(self._episode.tolist()):
@@ -280,3 +271,15 @@ class AtariEnv(BatchedEnv):
         return np.array_equal(frames, self._last_observation[:, -1]) and np.array_equal(
             lives, self._lives
         )
+
+
+def _check_actions(actions: np.ndarray, games: int, count: int, longest: int) -> None:
+    """Refuses a saved history that games cannot have had; for some, ale-py would wait forever."""
+    if actions.dtype != np.int16 or actions.ndim != 2 or len(actions) != games:
+        raise ValueError(f"its actions are not int16 of shape [{games}, time]")
+    if actions.shape[1] > longest:
+        raise ValueError(f"its actions are more than the {longest:,} steps of the longest game")
+    ended = actions == -1
+    resumed = ended[:, :-1] & ~ended[:, 1:]
+    if (actions < -1).any() or (actions >= count).any() or resumed.any():
+        raise ValueError(f"its actions are not between 0 and {count - 1}, with -1 after the last")

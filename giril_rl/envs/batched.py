@@ -1,4 +1,4 @@
-"""What every batched environment of a task has in common, whatever simulates it."""
+"""What all batched environments share: resets, episode seeds, and a state that can be restored."""
 
 from __future__ import annotations
 
@@ -15,32 +15,32 @@ from giril_rl.runs.randomness import Use, stream_seed
 
 
 class BatchedEnv(EnvBase):
-    """``num_envs`` simulators stepped as one TorchRL environment that can be brought back.
+    """``num_envs`` simulators stepped as one TorchRL environment whose state can be restored.
 
     ``("next", "observation")`` at an episode's end is the true terminal observation; the reset
-    observation appears only as the next step's ``"observation"``. Every episode (of games, every
-    64th) has a seed of its own, made of ``use``, ``seed``, the simulator's index and the episode's
-    number, so that any moment of a run can be rebuilt by replaying actions
+    observation appears only as the next step's ``"observation"``. Every episode (in Atari, every
+    64th) has its own seed, derived from ``use``, ``seed``, the simulator's index and the episode's
+    number. Replaying the actions since then rebuilds any moment of a run
     (:meth:`simulator_state`, :meth:`restore_simulator`).
 
     A subclass makes its simulators, calls :meth:`_declare` with its observation and action specs,
-    and defines ``_step``, ``_reset_where`` and the two methods that save and restore.
+    sets ``_last_observation``, and defines ``_step``, ``_reset_where`` and the two methods that
+    save and restore.
 
     Args:
         num_envs: number of simulators, the environment's batch size.
         seed: root of the episodes' seeds.
-        use: what the episodes are for; those of two uses never have equal seeds.
+        use: what the episodes are for; two uses never share seeds.
     """
 
     _onward_key = "observation"
-    """Entry of ``next`` from which a simulator goes on whose episode has not ended."""
+    """Entry of ``next`` from which a simulator continues when its episode has not ended."""
 
     has_threads = False
-    """Whether the simulators run in threads of their own."""
+    """Whether each simulator runs in its own thread."""
 
     first_index = 0
-    """The first simulator's number, of which episodes have their seeds; more than 0 where a larger
-    environment is played in parts."""
+    """Index of the first simulator, for seeds: above 0 where a larger environment is split."""
 
     _last_observation: np.ndarray
 
@@ -67,23 +67,22 @@ class BatchedEnv(EnvBase):
     ) -> tuple[TensorDictBase, TensorDictBase]:
         """Steps all simulators and resets those whose episode ended.
 
-        The same as :meth:`torchrl.envs.EnvBase.step_and_maybe_reset` without its general
-        bookkeeping, which costs more than fast simulators do.
+        Equals :meth:`torchrl.envs.EnvBase.step_and_maybe_reset` without its general bookkeeping,
+        which costs more than fast simulators do.
         """
-        following = self._step(tensordict)
-        tensordict.set("next", following)
-        done = following.get("done")
+        after = self._step(tensordict)
+        tensordict.set("next", after)
+        done = after.get("done")
         if done.any():
             observation = torch.from_numpy(self._reset_where(done.view(-1).numpy()))
         else:
-            observation = following.get(self._onward_key)
+            observation = after.get(self._onward_key)
         return tensordict, self._root(observation)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         mask = None if tensordict is None else tensordict.get("_reset", None)
         if self._restored:
-            # A restored simulator stands in the middle of its episodes: the first reset after
-            # that hands out where it stands.
+            # The first reset after a restore returns the middle of the restored episodes.
             self._restored = False
             return self._root(torch.from_numpy(self._last_observation.copy()))
         if mask is None:
@@ -105,7 +104,7 @@ class BatchedEnv(EnvBase):
 
     @abstractmethod
     def _reset_where(self, mask: np.ndarray) -> np.ndarray:
-        """Begins new episodes where ``mask`` says so; what all simulators then show."""
+        """Begins new episodes where ``mask`` is true; the observations of all simulators."""
 
     def _episode_seed(self, index: int) -> int:
         numbers = (self._root_seed, self.first_index + index, int(self._episode[index]))
@@ -117,18 +116,53 @@ class BatchedEnv(EnvBase):
 
     @abstractmethod
     def simulator_state(self) -> dict[str, Any]:
-        """What :meth:`restore_simulator` needs to bring another instance to this very moment."""
+        """What :meth:`restore_simulator` needs to bring another instance to this moment."""
 
     @abstractmethod
     def restore_simulator(self, state: dict[str, Any]) -> bool:
-        """Replays the running episodes; the next :meth:`reset` hands out where they stand.
+        """Replays the running episodes; the next :meth:`reset` continues them.
 
         Args:
-            state: what :meth:`simulator_state` returned for an equal environment.
+            state: what :meth:`simulator_state` of an equal environment returned.
 
         Returns:
-            Whether the replay came to the same moment; if not, all simulators begin new episodes.
+            Whether the replay reached the same moment; if not, all simulators begin new episodes.
 
         Raises:
-            ValueError: if it is no state of such an environment; nothing is played then.
+            ValueError: if it is not a state of such an environment; nothing is played then.
         """
+
+
+def saved_array(state: dict[str, Any], name: str, like: np.ndarray) -> np.ndarray:
+    """A copy of an entry of a saved state, checked against dtype and shape of ``like``.
+
+    Raises:
+        ValueError: if it is anything else: the checkpoint may come from anybody.
+    """
+    found = saved_tensor(state, name)
+    if found.dtype != like.dtype or found.shape != like.shape:
+        raise ValueError(f"its {name!r} is not {like.dtype} of shape {list(like.shape)}")
+    return found.copy()
+
+
+def saved_tensor(state: dict[str, Any], name: str) -> np.ndarray:
+    """An entry of a saved state that must be a tensor, not copied."""
+    found = state.get(name)
+    if not isinstance(found, torch.Tensor):
+        raise ValueError(f"its {name!r} is not a tensor")
+    return found.numpy()
+
+
+def saved_seed(state: dict[str, Any]) -> int:
+    """The root of the episodes' seeds in a saved state."""
+    seed = state.get("seed")
+    if type(seed) is not int or seed < 0:
+        raise ValueError("its seed is not a natural number")
+    return seed
+
+
+def check_counts(name: str, counts: np.ndarray, least: int, most: int | None = None) -> None:
+    """Refuses counts in a saved state that no simulator can have reached."""
+    if (counts < least).any() or (most is not None and (counts > most).any()):
+        span = f"at least {least}" if most is None else f"between {least} and {most}"
+        raise ValueError(f"its {name!r} is not {span}")

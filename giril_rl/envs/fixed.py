@@ -1,4 +1,4 @@
-"""Episodes of one length: a failure no longer ends them, so that staying alive pays nothing."""
+"""Episodes of fixed length: a failure does not end them, so that survival alone pays nothing."""
 
 from __future__ import annotations
 
@@ -11,9 +11,8 @@ import torch
 from tensordict import TensorDictBase
 from torchrl.data import Categorical
 
-from giril_rl.envs.checking import env_name
-from giril_rl.envs.saved import saved_array
-from giril_rl.envs.spaces import shortest_limit
+from giril_rl.envs.batched import saved_array
+from giril_rl.envs.gym_api import env_name, shortest_limit
 from giril_rl.envs.vector import GymVectorEnv
 from giril_rl.errors import UserError
 from giril_rl.runs.randomness import Use
@@ -25,33 +24,33 @@ class FixedHorizonEnv(GymVectorEnv):
     """A :class:`GymVectorEnv` whose episodes all last until the time limit, which truncates them.
 
     After a failure the simulator is reset without telling the learner (``after_failure="reset"``,
-    ``done`` stays False), or runs on from where it failed (``"continue"``), which PyBullet's
+    ``done`` stays False), or continues from where it failed (``"continue"``), which PyBullet's
     simulators allow: a fallen pendulum hangs and swings.
 
-    ``("next", "observation")`` is the true next state also at a hidden reset, where it is the
-    failed one: the reward of a transition must not see the jump. Two further entries of ``next``
-    tell what follows:
+    ``("next", "observation")`` is the true next observation, also at a hidden reset, where it is
+    that of the failed state: a transition's reward must not see the jump. ``next`` has two more
+    entries:
 
-    - ``following_observation``, the state from which the simulator really goes on. It equals
-      ``observation`` but at a hidden reset, where it is the reset observation. A learner's
-      bootstrapped value must be that of this state; :class:`giril_rl.training.PPOLearner` uses it.
-    - ``scored``, whether the step belongs to an episode of the task itself: True up to and with
-      the first failure since the horizon began. The sum of these rewards is the task's own score.
+    - ``following_observation``, from which the simulator really continues. It differs from
+      ``observation`` only at a hidden reset, where it is the reset observation. A learner must
+      bootstrap from its value, as :class:`giril_rl.training.PPO` does.
+    - ``scored``, whether the step belongs to an episode of the task itself: True up to and
+      including the first failure since the horizon began. The sum of these rewards is the task's
+      own score.
 
     Step it with :meth:`step_and_maybe_reset`, as collectors and ``rollout`` without a break do:
-    TorchRL's ``step_mdp`` knows nothing of a hidden reset.
+    TorchRL's ``step_mdp`` does not know of hidden resets.
 
     Args:
         make_fn: as for :class:`GymVectorEnv`.
         num_envs: number of copies.
         after_failure: "reset" or "continue".
-        seed: root of the episodes' seeds; each hidden reset begins an episode with its own.
-        use: what the episodes are for; those of two uses never have equal seeds.
-        max_episode_steps: the horizon; None takes the shortest limit that the environment has,
-            which counts as well where it is shorter.
+        seed: root of the episodes' seeds; each hidden reset begins an episode with its own seed.
+        use: what the episodes are for; two uses never share seeds.
+        max_episode_steps: the horizon, unless the environment has a shorter limit; None takes that.
 
     Raises:
-        UserError: as :class:`GymVectorEnv`, and where there is no time limit; at a step, if an
+        UserError: as :class:`GymVectorEnv`, and without any time limit; at a step, if an
             environment truncates an episode by itself before the horizon.
 
     Examples:
@@ -78,7 +77,7 @@ class FixedHorizonEnv(GymVectorEnv):
         max_episode_steps: int | None = None,
     ) -> None:
         super().__init__(make_fn, num_envs, seed=seed, use=use, max_episode_steps=max_episode_steps)
-        # A limit below another wrapper would begin anew at each hidden reset.
+        # A limit below another wrapper would restart at each hidden reset.
         limits = (self._limit, shortest_limit(self._gym_envs[0]))
         known = [limit for limit in limits if limit is not None]
         if not known:
@@ -142,7 +141,7 @@ class FixedHorizonEnv(GymVectorEnv):
         return self._played
 
     def simulator_state(self) -> dict[str, Any]:
-        """As :meth:`GymVectorEnv.simulator_state`, with what a hidden reset leaves to know.
+        """As :meth:`GymVectorEnv.simulator_state`, with the clocks of hidden resets.
 
         The actions are those since the last reset of a simulator, hidden ones included.
         """

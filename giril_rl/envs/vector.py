@@ -1,27 +1,34 @@
-"""A lean batched TorchRL environment over Gymnasium environments with vector observations."""
+"""A lean batched TorchRL environment over copies of a Gymnasium environment."""
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import gymnasium
 import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torchrl.data import Bounded, Unbounded
+from torchrl.data import Bounded, TensorSpec, Unbounded
 
-from giril_rl.envs.batched import BatchedEnv
-from giril_rl.envs.checking import check_reset, check_step, env_name
-from giril_rl.envs.saved import check_actions, check_counts, saved_array, saved_seed, saved_tensor
-from giril_rl.envs.spaces import (
+from giril_rl.envs.batched import (
+    BatchedEnv,
+    check_counts,
+    saved_array,
+    saved_seed,
+    saved_tensor,
+)
+from giril_rl.envs.gym_api import (
     action_spec,
+    check_copies,
+    check_reset,
+    check_step,
+    env_name,
     fill_unbounded,
-    shortest_limit,
+    silent_stdout,
     without_bookkeeping,
 )
-from giril_rl.envs.stdout import silent_stdout
 from giril_rl.errors import UserError
 from giril_rl.runs.randomness import Use
 
@@ -29,35 +36,30 @@ from giril_rl.runs.randomness import Use
 class GymVectorEnv(BatchedEnv):
     """``num_envs`` copies of a Gymnasium environment stepped as one TorchRL environment.
 
-    ``("next", "observation")`` at an episode's end is the true terminal observation; the reset
-    observation appears only as the next step's ``"observation"``. A time limit is a truncation,
-    a failure a termination. Every episode has a seed of its own, drawn from ``seed``, the copy's
-    index and the episode's number, so that any moment of a run can be rebuilt by replaying the
-    actions since the last reset (:meth:`simulator_state`, :meth:`restore_simulator`).
+    ``("next", "observation")`` at an episode's end is the true terminal observation. A time limit
+    truncates, a failure terminates. See :class:`BatchedEnv` for seeds and restoring.
 
-    A copy is stepped with the action clamped to its bounds, in each dimension that has one: most
-    simulators clamp by themselves before they act, but some pay for the action as it was given.
-    Observations become float32, whatever numbers they are.
+    Actions are clamped to their bounds, in each dimension that has one: most simulators clamp by
+    themselves, but some pay for the action as given. Observations become float32.
 
-    TorchRL's own ``GymWrapper(SyncVectorEnv(...))`` gives the same transitions; this class exists
-    because it is 1.4 times as fast for simulators that step in tens of microseconds
-    (``tests/benchmarks/parts.py``), and because Gymnasium has no way to save a simulator's state.
+    TorchRL's ``GymWrapper(SyncVectorEnv(...))`` gives the same transitions. This class is 1.4 times
+    as fast for simulators that step in tens of microseconds (``tests/benchmarks/parts.py``) and can
+    save a simulator's state, which Gymnasium cannot.
 
     Args:
-        make_fn: makes one Gymnasium environment, a new one at each call, with a one-dimensional
-            Box observation and a Box (of real numbers) or Discrete (counted from 0) action space.
+        make_fn: makes a new Gymnasium environment at each call, with a one-dimensional Box
+            observation and a Box (of real numbers) or Discrete (counted from 0) action space.
             Discrete actions are integers, not one-hot vectors.
         num_envs: number of copies, the environment's batch size.
         seed: root of the episodes' seeds.
-        use: what the episodes are for; those of two uses never have equal seeds.
-        max_episode_steps: a time limit in steps beside those that the environment has; the
-            shortest counts. ``gymnasium.make(id, max_episode_steps=...)`` replaces the one that it
-            is registered with.
+        use: what the episodes are for; two uses never share seeds.
+        max_episode_steps: a further time limit in steps; the shortest of all counts.
+            ``gymnasium.make(id, max_episode_steps=...)`` replaces the registered one.
 
     Raises:
-        UserError: if the observation or action space is of another kind, if ``make_fn`` returns one
-            environment several times or environments that differ; at the first reset or step, if an
-            observation is not of its space's shape or a reward is not a number.
+        UserError: for another kind of space; if ``make_fn`` returns one environment several times,
+            or environments that differ; at the first reset or step, if an observation is not of its
+            space's shape or a reward is not a number.
 
     Examples:
         >>> import gymnasium
@@ -83,33 +85,35 @@ class GymVectorEnv(BatchedEnv):
             raise UserError(f"max_episode_steps={max_episode_steps}: at least 1 is needed.")
         with silent_stdout():
             made = [make_fn() for _ in range(num_envs)]
-        _check_copies(made)
+        check_copies(made)
         self._gym_envs, limits = zip(*map(without_bookkeeping, made), strict=True)
         limits = [limit for limit in (max_episode_steps, limits[0]) if limit is not None]
         self._limit: int | None = min(limits, default=None)
         self._steps = np.zeros(num_envs, dtype=np.int64)
         self._started = self._stepped = False
         self._actions: list[np.ndarray] = []
-        self._last_observation = np.zeros((num_envs, 0), dtype=np.float32)
         self._make_specs(self._gym_envs[0])
 
     def _make_specs(self, env: gymnasium.Env) -> None:
-        observation, action = env.observation_space, env.action_space
-        name = env_name(env)
-        if not isinstance(observation, gymnasium.spaces.Box) or len(observation.shape) != 1:
-            raise UserError(
-                f"{name} has observations of the kind {observation}: choose a task with a vector "
-                "(one-dimensional Box) observation."
-            )
-        n = self.batch_size[0]
-        actions = action_spec(action, n, name)
+        observation = self._observation_spec(env)
+        action = env.action_space
+        actions = action_spec(action, self.batch_size[0], env_name(env))
         bounded = isinstance(actions, Bounded)
         self._bounds = (action.low, action.high) if bounded else None  # type: ignore[attr-defined]
         self._half_bounded = (
             bounded and not (actions.space.high - actions.space.low).isfinite().all()
         )
-        self._declare(Unbounded((n, *observation.shape), dtype=torch.float32), actions)
-        self._last_observation = np.zeros((n, *observation.shape), dtype=np.float32)
+        self._declare(observation, actions)
+        self._last_observation = observation.zero().numpy()
+
+    def _observation_spec(self, env: gymnasium.Env) -> TensorSpec:
+        space = env.observation_space
+        if not isinstance(space, gymnasium.spaces.Box) or len(space.shape) != 1:
+            raise UserError(
+                f"{env_name(env)} has observations of the kind {space}: choose a task with a "
+                "vector (one-dimensional Box) observation."
+            )
+        return Unbounded((self.batch_size[0], *space.shape), dtype=torch.float32)
 
     def rand_action(self, tensordict: TensorDictBase | None = None) -> TensorDictBase:
         """TorchRL's, and :func:`fill_unbounded` where a dimension lacks a bound."""
@@ -119,7 +123,7 @@ class GymVectorEnv(BatchedEnv):
         return drawn
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        # A copy, for the caller may reuse its memory and the history may not change.
+        # A copy: the caller may reuse the memory.
         actions = tensordict.get("action").numpy()
         actions = actions.copy() if self._bounds is None else actions.clip(*self._bounds)
         self._actions.append(actions)
@@ -159,7 +163,7 @@ class GymVectorEnv(BatchedEnv):
         return self._restart(mask)
 
     def _restart(self, mask: np.ndarray) -> np.ndarray:
-        """Resets simulators, each with its next episode's seed; what all copies then show."""
+        """Resets simulators, each with its next episode's seed; the observations of all."""
         observation = self._last_observation.copy()
         with silent_stdout() if not self._started else contextlib.nullcontext():
             for i in np.flatnonzero(mask).tolist():
@@ -172,15 +176,15 @@ class GymVectorEnv(BatchedEnv):
         return observation
 
     def _replayed(self) -> np.ndarray:
-        """How many actions lead each copy from its simulator's last reset to where it stands."""
+        """Number of actions since the last reset of each simulator."""
         return self._steps
 
     def simulator_state(self) -> dict[str, Any]:
-        """What :meth:`restore_simulator` needs to bring another instance to this very moment.
+        """See :meth:`BatchedEnv.simulator_state`.
 
         Returns:
-            Tensors only: the episodes' numbers and lengths, the actions since the longest running
-            episode began, shape ``(time, num_envs, ...)``, and the present observation.
+            Tensors and the seed: the episodes' numbers and lengths, the actions since the longest
+            running episode began, ``(time, num_envs, ...)``, and the present observation.
         """
         actions = np.stack(self._actions) if self._actions else np.zeros((0,), dtype=np.float32)
         return {
@@ -192,17 +196,9 @@ class GymVectorEnv(BatchedEnv):
         }
 
     def restore_simulator(self, state: dict[str, Any]) -> bool:
-        """Replays the running episodes; the next :meth:`reset` hands out where they stand.
+        """See :meth:`BatchedEnv.restore_simulator`.
 
-        Args:
-            state: what :meth:`simulator_state` returned for an equal environment.
-
-        Returns:
-            Whether the replay came to the same moment. If not, the simulator does not repeat itself
-            for the same seed and actions, and all copies begin their next episodes.
-
-        Raises:
-            ValueError: if it is no state of such an environment; nothing is played then.
+        A replay fails if the simulator does not repeat itself for the same seed and actions.
         """
         saved = saved_array(state, "observation", self._last_observation)
         self._root_seed = saved_seed(state)
@@ -215,7 +211,7 @@ class GymVectorEnv(BatchedEnv):
         check_counts("steps", steps, 0, len(actions))
         if steps.max():
             count = getattr(self.action_spec.space, "n", None)
-            check_actions(actions, self.action_spec.shape, self._bounds, count)
+            _check_actions(actions, self.action_spec.shape, self._bounds, count)
         self._actions = list(actions) if steps.max() else []
         with silent_stdout():
             shown = [self._replay(i, actions[len(actions) - steps[i] :]) for i in range(len(saved))]
@@ -230,7 +226,7 @@ class GymVectorEnv(BatchedEnv):
         return False
 
     def _replay(self, i: int, actions: np.ndarray) -> np.ndarray | None:
-        """What copy ``i`` shows after its ``actions``; None if its episode ended before them."""
+        """Observation of copy ``i`` after ``actions``; None if its episode ended before them."""
         env = self._gym_envs[i]
         self._episode[i] -= 1
         observation, _ = env.reset(seed=self._episode_seed(i))
@@ -241,10 +237,10 @@ class GymVectorEnv(BatchedEnv):
                 return None
             observation, _, failed, cut, _ = env.step(action[i])
             over = cut or (failed and self._failure_ends)
-        return np.asarray(observation, dtype=np.float32)
+        return np.asarray(observation, dtype=self._last_observation.dtype)
 
     def _restore_clocks(self, state: dict[str, Any]) -> None:
-        """Takes what a subclass added to :meth:`simulator_state`."""
+        """Restores what a subclass added to :meth:`simulator_state`."""
 
     def close(self, *, raise_if_closed: bool = True) -> None:
         """Closes every copy."""
@@ -254,21 +250,45 @@ class GymVectorEnv(BatchedEnv):
         super().close(raise_if_closed=raise_if_closed)
 
 
-def _check_copies(envs: list[gymnasium.Env]) -> None:
-    """Refuses environments that share a simulator, or are not of one kind."""
-    name = env_name(envs[0])
-    if len({id(env.unwrapped) for env in envs}) < len(envs):
-        raise UserError(
-            f"make_fn returned the same {name} several times, which cannot play {len(envs)} "
-            "episodes at once: make a new environment at each call."
-        )
-    kinds = {
-        "observation_space": lambda env: (env.observation_space.shape, env.observation_space.dtype),
-        "action_space": lambda env: env.action_space,
-        "time limit": shortest_limit,
-    }
-    for what, kind in kinds.items():
-        if any(kind(env) != kind(envs[0]) for env in envs):
+class GymImageEnv(GymVectorEnv):
+    """A :class:`GymVectorEnv` of images, uint8 ``(channels, height, width)``.
+
+    The batched environment of a family with images, see :func:`~giril_rl.envs.register_family`.
+
+    Args:
+        make_fn: as for :class:`GymVectorEnv`, with uint8 observations of three dimensions.
+        num_envs: number of copies.
+        seed: root of the episodes' seeds.
+        use: what the episodes are for.
+        max_episode_steps: as for :class:`GymVectorEnv`.
+
+    Raises:
+        UserError: as :class:`GymVectorEnv`, and for observations of another kind.
+    """
+
+    def _observation_spec(self, env: gymnasium.Env) -> TensorSpec:
+        space = env.observation_space
+        shape = space.shape if isinstance(space, gymnasium.spaces.Box) else ()
+        if len(shape) != 3 or space.dtype != np.uint8:
             raise UserError(
-                f"make_fn returned environments that differ in their {what}: make equal ones."
+                f"{env_name(env)} has observations of the kind {space}: a family of images needs "
+                "uint8 (channels, height, width)."
             )
+        return Bounded(0, 255, shape=(self.batch_size[0], *shape), dtype=torch.uint8)
+
+
+def _check_actions(
+    actions: np.ndarray,
+    shape: Sequence[int],
+    bounds: tuple[np.ndarray, np.ndarray] | None,
+    count: int | None,
+) -> None:
+    """Refuses a saved history of actions that simulators cannot have had."""
+    real = count is None
+    if actions.shape[1:] != tuple(shape) or actions.dtype.kind != ("f" if real else "i"):
+        raise ValueError("its actions are of another shape or type than this task's")
+    inside = np.isfinite(actions) if real else (actions >= 0) & (actions < count)
+    if bounds is not None:
+        inside &= (actions >= bounds[0]) & (actions <= bounds[1])
+    if not inside.all():
+        raise ValueError("its actions are not ones of this task")

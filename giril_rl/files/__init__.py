@@ -1,1 +1,1 @@
-"""Reading and writing files: atomically, safely from strangers, with numbered formats."""
+"""Files: atomic writing, and reading that cannot run code or fill the memory."""

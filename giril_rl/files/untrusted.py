@@ -1,10 +1,11 @@
-"""Text of files that anyone may have written: bounded in size, depth and expansion, only data."""
+"""Safe reading of files that anyone may have written: bounded size and depth, data only."""
 
 from __future__ import annotations
 
 import json
 import os
 import re
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -13,14 +14,14 @@ import yaml
 from giril_rl.errors import UserError
 
 MOST_BYTES = 16 * 2**20
-"""Of a file of settings, results or metadata."""
+"""The largest file of settings, results or metadata that is read."""
 _MOST_NODES = 100_000
 _DEEPEST = 50
 _PLAIN_REFERENCE = re.compile(r"\$\{[\w.\[\]]+\}")
 
 
 def read_text(path: Path) -> str:
-    """The UTF-8 text of a file that is not larger than :data:`MOST_BYTES`.
+    """The UTF-8 text of a file of at most :data:`MOST_BYTES`.
 
     Raises:
         OSError: if it cannot be read.
@@ -34,7 +35,7 @@ def read_text(path: Path) -> str:
 
 
 def parse_json(text: str | bytes) -> Any:
-    """``text`` as JSON.
+    """Parse JSON.
 
     Raises:
         ValueError: if it is not JSON, or nested too deeply.
@@ -52,13 +53,11 @@ def parse_json(text: str | bytes) -> Any:
 
 
 def check_yaml(text: str) -> None:
-    """Looks whether ``text`` can be loaded as YAML without filling the memory.
-
-    A few lines of aliases to aliases stand for more nodes than there is room for.
+    """Refuse YAML that would fill the memory: a few lines of nested aliases can expand to billions.
 
     Raises:
         yaml.YAMLError: if it is not YAML.
-        ValueError: if it is nested too deeply or stands for too many nodes.
+        ValueError: if it is nested too deeply, or expands to too many values.
 
     Examples:
         >>> check_yaml("seed: 3")
@@ -93,11 +92,11 @@ def check_yaml(text: str) -> None:
 
 
 def parse_yaml(text: str) -> Any:
-    """``text`` as YAML of plain values, after :func:`check_yaml`.
+    """Parse YAML of plain values, after :func:`check_yaml`.
 
     Raises:
-        yaml.YAMLError: if it is not YAML, or has a tag that is not of plain values.
-        ValueError: as :func:`check_yaml`.
+        yaml.YAMLError: if it is not YAML, or has a tag for anything but plain values.
+        ValueError: as in :func:`check_yaml`.
 
     Examples:
         >>> parse_yaml("seed: 3")
@@ -108,14 +107,13 @@ def parse_yaml(text: str) -> Any:
 
 
 def check_references(value: Any, where: str = "") -> None:
-    """Refuses ``${...}`` in settings unless it is the key of another setting.
+    """Refuse ``${...}`` in settings unless it names another setting.
 
-    OmegaConf's resolvers read what is no setting, such as environment variables, and a run's
-    settings are written down and shared.
+    OmegaConf's resolvers can read environment variables, and a run's settings are saved and shared.
 
     Args:
-        value: settings, unresolved.
-        where: what names them in the refusal.
+        value: unresolved settings.
+        where: their dotted key, for the message.
 
     Raises:
         UserError: for the first other reference.
@@ -140,11 +138,11 @@ def check_references(value: Any, where: str = "") -> None:
 
 
 def check_memory(what: str, size: int) -> None:
-    """Refuses data that the machine's memory cannot hold, before any of it is read.
+    """Refuse data larger than the machine's memory, before reading any of it.
 
     Args:
-        what: names the data in the refusal.
-        size: bytes that it takes once loaded.
+        what: the data's name, for the message.
+        size: bytes it takes once loaded.
 
     Raises:
         UserError: if that is more than all memory.
@@ -158,9 +156,41 @@ def check_memory(what: str, size: int) -> None:
     try:
         memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     except (AttributeError, OSError, ValueError):
-        return  # Not to be known here.
+        return  # Unknown on this system.
     if size > memory:
         raise UserError(
             f"{what} says that it holds {size / 1e9:,.0f} GB, more than this machine's memory: "
             "check where it is from, or take fewer episodes."
         )
+
+
+def check_format(found: Any, readable: Collection[int], *, where: str, older: str) -> None:
+    """Refuse a file format that this version cannot read, and say what to do.
+
+    Args:
+        found: the number in the file; it may be of any type.
+        readable: the formats that this version reads.
+        where: the file and the kind of format, such as ``"a.json has card format"``.
+        older: what to do about an older file, or one without a number.
+
+    Raises:
+        UserError: if ``found`` is not one of ``readable``.
+
+    Examples:
+        >>> check_format(1, [1], where="card.json has format", older="save it again")
+        >>> check_format(9, [1], where="card.json has format", older="save it again")
+        Traceback (most recent call last):
+        ...
+        giril_rl.errors.UserError: card.json has format 9, written by a later giril_rl (this one
+        reads up to 1): upgrade giril_rl.
+    """
+    if type(found) is int and found in readable:
+        return
+    newest = max(readable)
+    if type(found) is int and found > newest:
+        raise UserError(
+            f"{where} {found}, written by a later giril_rl (this one reads up to {newest}): "
+            "upgrade giril_rl."
+        )
+    known = " and ".join(map(str, sorted(readable)))
+    raise UserError(f"{where} {found!r}, and this giril_rl reads only {known}: {older}.")

@@ -1,1 +1,14 @@
-"""A gradient step recorded or compiled as one graph."""
+"""A module's computation recorded once as a graph of tensor operations, then run without Python."""
+
+from giril_rl.graphs.compiling import compiled
+from giril_rl.graphs.gradients import TracedGradients
+from giril_rl.graphs.recording import CannotRecord, ModuleGraph, convolves, record
+
+__all__ = [
+    "CannotRecord",
+    "ModuleGraph",
+    "TracedGradients",
+    "compiled",
+    "convolves",
+    "record",
+]

@@ -8,14 +8,7 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 
-from giril_rl.config.schema import (
-    DemoConfig,
-    ExpertConfig,
-    FitConfig,
-    RunConfig,
-    ScalingConfig,
-    knob,
-)
+from giril_rl.config.schema import AveragedRunConfig, FitConfig, knob
 from giril_rl.demos import Demonstration, holdout, subsample
 from giril_rl.envs import BatchedEnv
 from giril_rl.methods.registry import controls
@@ -23,12 +16,18 @@ from giril_rl.rewards import CuriosityConfig, GenerativeConfig
 from giril_rl.rewards.method import Method
 from giril_rl.runs.metrics import METRICS, read_metrics
 from giril_rl.runs.run import Run
-from giril_rl.training.fit import fit_reward
+from giril_rl.training import (
+    HeldAction,
+    RandomPolicy,
+    check_discrete,
+    fit_reward,
+    held_action_scores,
+)
 from giril_rl.transforms.intrinsic import device_of
 
 
 @dataclass
-class ControlRunConfig(RunConfig):
+class ControlRunConfig(AveragedRunConfig):
     """Settings of the controls' recipe; those that the chosen reward does not use are not read."""
 
     reward: str = knob(
@@ -38,12 +37,9 @@ class ControlRunConfig(RunConfig):
         choices=list(controls()),
     )
     held_episodes: int = knob(20, "held_action: episodes that choose the action", low=1)
-    expert: ExpertConfig = field(default_factory=ExpertConfig)
-    demo: DemoConfig = field(default_factory=DemoConfig)
     giril: GenerativeConfig = field(default_factory=GenerativeConfig)
     icm: CuriosityConfig = field(default_factory=CuriosityConfig)
     fit: FitConfig = field(default_factory=FitConfig)
-    scaling: ScalingConfig = field(default_factory=ScalingConfig)
 
     @property
     def method(self) -> Method:
@@ -59,6 +55,38 @@ class ControlRunConfig(RunConfig):
     def trains(self) -> bool:
         """Whether a policy is trained on a reward, rather than a fixed policy scored."""
         return self.method.build is not None
+
+
+def check_baseline(cfg: ControlRunConfig) -> None:
+    """Refuses a policy that the task's actions do not allow, before any long work.
+
+    Raises:
+        UserError: for ``held_action`` without discrete actions, ``random`` without bounds.
+    """
+    if cfg.reward == "held_action":
+        check_discrete(cfg.task)
+    elif cfg.reward == "random":
+        RandomPolicy.of_task(cfg.task, cfg.seed)
+
+
+def baseline_policy(cfg: ControlRunConfig, run: Run) -> RandomPolicy | HeldAction | None:
+    """The policy that is scored as it is; None where the control is a reward to learn from.
+
+    The held action is chosen in episodes of the training's seed and scored in the evaluation's.
+
+    Args:
+        cfg: the run's settings.
+        run: where the scores of all actions are logged.
+    """
+    if cfg.reward == "random":
+        return RandomPolicy.of_task(cfg.task, cfg.seed)
+    if cfg.reward != "held_action":
+        return None
+    scores = held_action_scores(cfg.task, episodes=cfg.held_episodes, seed=cfg.seed)
+    run.truncate_metrics("held_action", -1)
+    for action, score in enumerate(scores):
+        run.log(action, {"held_action/return_mean": score}, phase="held_action")
+    return HeldAction.of_task(cfg.task, scores.index(max(scores)))
 
 
 def control_reward(
@@ -91,7 +119,7 @@ def control_reward(
             cfg.fit,
             seed=seed,
             run=run,
-            held_out=holdout(demo, cfg.demo.subsample),
+            validation=holdout(demo, cfg.demo.subsample),
         )
     if method.derive is None:
         return reward, seeds

@@ -6,7 +6,7 @@ information in z, by :func:`~giril_rl.rewards.adversarial.dual_step`.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -219,6 +219,14 @@ class BottleneckLoss(DiscriminatorLoss):
     def update_beta(self, kl: Tensor) -> None:
         """The dual step, in place, for the mean KL that :meth:`forward` returned."""
         self.beta.copy_(dual_step(self.beta, kl, self.information, self.beta_step))
+
+    def after_step(self, log: Mapping[str, Tensor]) -> None:
+        """The dual step on beta."""
+        self.update_beta(log["kl"])
+
+    def logged_state(self) -> dict[str, float]:
+        """Beta."""
+        return {"beta": self.beta.item()}
 
     def _judge(
         self, observation: Tensor, encoding: Tensor, experts: int

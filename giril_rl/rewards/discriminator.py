@@ -7,7 +7,7 @@ Labels, forms of the reward and the gradient penalty are pure functions in
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal, get_args
 
@@ -338,6 +338,13 @@ class DiscriminatorLoss(RewardLoss):
     def log_keys(self) -> list[str]:
         """Names of what is logged."""
         return ["accuracy_expert", "accuracy_policy"]
+
+    def after_step(self, log: Mapping[str, Tensor]) -> None:
+        """Follows each gradient step; ``log`` has the step's :attr:`log_keys`."""
+
+    def logged_state(self) -> dict[str, float]:
+        """Numbers of the loss's own that are worth logging."""
+        return {}
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

@@ -1,1 +1,1 @@
-"""A run's life on disk: its folder, metrics, checkpoints, result, interruption and resuming."""
+"""A run on disk: its folder, metrics, checkpoints and result, and how it stops and resumes."""

@@ -1,7 +1,9 @@
-"""Reading what a run left behind."""
+"""Reads what a finished run left: its checked result, its settings, its scores as text."""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable, Collection
 from dataclasses import fields
 from pathlib import Path
 from typing import Any, TypeVar
@@ -12,18 +14,39 @@ from giril_rl.config.leaves import leaves
 from giril_rl.config.schema import EvalConfig, TaskConfig
 from giril_rl.config.validation import validate
 from giril_rl.errors import UserError
-from giril_rl.files.formats import check_run_format
-from giril_rl.files.untrusted import parse_yaml, read_text
-from giril_rl.runs.result_file import read_result_file
+from giril_rl.files.disk import read_json
+from giril_rl.files.untrusted import check_format, parse_yaml, read_text
 
+RUN_FORMAT = 2
+"""The format of a run's folder, in its ``versions.json``; a folder without a number has format 1.
+
+Format 1 has the same files, made with other random numbers: it can be read but not continued.
+"""
 Part = TypeVar("Part")
 
 
-def read_result(folder: Path) -> dict[str, Any]:
-    """A finished run's ``result.json``.
+def check_run_format(folder: Path, readable: Collection[int] = (1, RUN_FORMAT)) -> None:
+    """Refuse a run's folder of another format, by its ``versions.json``.
 
     Raises:
-        UserError: if the folder holds no finished run, one of a later format or a damaged one.
+        UserError: if its format is not one of ``readable``.
+    """
+    path = folder / "versions.json"
+    if path.is_file():
+        check_format(
+            read_json(path).get("format_version", 1),
+            readable,
+            where=f"{folder} has run format",
+            older="use the version that made it, or make the run anew",
+        )
+
+
+def read_result(folder: Path) -> dict[str, Any]:
+    """A finished run's ``result.json``, with every entry checked.
+
+    Raises:
+        UserError: if there is no finished run, one of a later format, or one with an entry that no
+            run writes.
     """
     check_run_format(folder)
     path = folder / "result.json"
@@ -31,14 +54,20 @@ def read_result(folder: Path) -> dict[str, Any]:
         raise UserError(
             f"{folder} holds no finished run (no result.json): run it to its end first."
         )
-    return read_result_file(path)
+    result = read_json(path)
+    wrong = _first_wrong(result)
+    if wrong is not None:
+        raise UserError(
+            f"{path} has no {wrong} as a run writes it: restore a copy, or make the run anew."
+        )
+    return result
 
 
 def read_settings(folder: Path) -> tuple[TaskConfig, EvalConfig]:
-    """A run's task, policy and evaluation settings, from its ``config.yaml``.
+    """A run's task and evaluation settings, from its ``config.yaml``.
 
     Raises:
-        UserError: if the file is missing or is not what a run writes.
+        UserError: if the file is missing or no run wrote it.
     """
     config = read_config(folder)
     return (
@@ -48,10 +77,10 @@ def read_settings(folder: Path) -> tuple[TaskConfig, EvalConfig]:
 
 
 def read_config(folder: Path) -> dict[str, Any]:
-    """What a run's ``config.yaml`` holds, nested.
+    """A run's nested settings, from its ``config.yaml``.
 
     Raises:
-        UserError: if the file is missing or is not what a run writes.
+        UserError: if the file is missing or no run wrote it.
     """
     try:
         config = parse_yaml(read_text(folder / "config.yaml"))
@@ -63,12 +92,10 @@ def read_config(folder: Path) -> dict[str, Any]:
 
 
 def read_part(folder: Path, config: dict[str, Any], name: str, kind: type[Part]) -> Part:
-    """One part of :func:`read_config`'s settings as the dataclass that it was made of.
-
-    Keys that the dataclass does not have are passed over.
+    """One part of :func:`read_config`'s settings as its dataclass; unknown keys are skipped.
 
     Raises:
-        UserError: if there is no such part.
+        UserError: if the part is missing, or a value has the wrong type or is out of range.
     """
     names = {f.name for f in fields(kind)}  # type: ignore[arg-type]
     try:
@@ -86,7 +113,7 @@ def read_part(folder: Path, config: dict[str, Any], name: str, kind: type[Part])
 
 
 def print_scores(folder: Path) -> None:
-    """Prints a finished run's scores, beside its expert's and its demonstration's."""
+    """Print a finished run's scores, and those of its expert and demonstration."""
     result = read_result(folder)
     print(f"{result['method']} on {result['task']}: {result['env_steps']:,} steps, {folder}")
     for who in ("expert", "demo"):
@@ -97,8 +124,9 @@ def print_scores(folder: Path) -> None:
 
 
 def print_both(scores: dict[str, Any]) -> None:
+    """Print the scores of the sampled policy and, if there are any, of the deterministic one."""
     print(describe("sampled", scores))
-    if scores.get("deterministic") is not None:  # Runs of an early version have none.
+    if scores.get("deterministic") is not None:  # Early versions have none.
         print(describe("deterministic", scores["deterministic"]))
 
 
@@ -120,3 +148,72 @@ def describe(kind: str, scores: dict[str, Any]) -> str:
 
 def _no_run(folder: Path) -> UserError:
     return UserError(f"{folder} is not a run's folder (no readable config.yaml).")
+
+
+Check = Callable[[Any], bool]
+
+
+def _text(value: Any) -> bool:
+    return isinstance(value, str) and value != "" and value.isprintable()
+
+
+def _count(value: Any) -> bool:
+    return type(value) is int and 0 <= value < 2**63
+
+
+def _number(value: Any) -> bool:
+    if type(value) is int:
+        return _count(abs(value))
+    return isinstance(value, float) and math.isfinite(value)
+
+
+def _is(kind: type) -> Check:
+    return lambda value: isinstance(value, kind)
+
+
+def _or_none(check: Check) -> Check:
+    return lambda value: value is None or check(value)
+
+
+_SCORES: dict[str, Check] = dict.fromkeys(
+    ("return_mean", "return_std", "return_median", "episode_length_mean"), _number
+)
+_NEEDED: dict[str, Check] = {
+    **dict.fromkeys(("method", "task"), _text),
+    **dict.fromkeys(("seed", "env_steps", "episodes"), _count),
+    **_SCORES,
+    "config_hash": _text,
+}
+_SECONDS_AND_RETURNS = (
+    *("wall_seconds", "fit_seconds", "steps_per_second"),
+    *("life_length_mean", "expert_return_mean", "demo_return_mean"),
+)
+# Some kinds of runs, and runs of earlier versions, do not have these.
+_OPTIONAL: dict[str, Check] = {
+    **dict.fromkeys(("seeds", "versions"), _is(dict)),
+    "deterministic": _or_none(_is(dict)),
+    **dict.fromkeys(("profile", "demo", "demo_id", "processor"), _or_none(_text)),
+    **dict.fromkeys(_SECONDS_AND_RETURNS, _or_none(_number)),
+    **dict.fromkeys(("inexact_resumes", "held_action"), _count),
+    "demo_transitions": _or_none(_count),
+    "random_policy": _is(bool),
+}
+
+
+def _first_wrong(result: dict[str, Any]) -> str | None:
+    """The first entry of a ``result.json`` that no run writes."""
+    for key, check in _NEEDED.items():
+        if not check(result.get(key)):
+            return key
+    for key, check in _OPTIONAL.items():
+        if key in result and not check(result[key]):
+            return key
+    for part, check in (("seeds", _count), ("versions", _text)):
+        for key, value in result.get(part, {}).items():
+            if not _or_none(check)(value):
+                return f"{part}.{key}" if _text(key) else part
+    mode = result.get("deterministic")
+    for key, check in _SCORES.items():
+        if mode is not None and not check(mode.get(key)):
+            return f"deterministic.{key}"
+    return None

@@ -1,36 +1,33 @@
-"""Ctrl-C that lets a loop save before it stops."""
+"""Ctrl-C: a loop saves its state before it stops."""
 
 from __future__ import annotations
 
 import os
 import signal
 import threading
-from types import FrameType, TracebackType
+from types import FrameType
 from typing import Any
 
 
 class Interrupted(KeyboardInterrupt):
-    """A loop stopped because it was asked to, after having saved its state.
-
-    Examples:
-        >>> str(Interrupted.at(120_000, 300_000))
-        'interrupted at 120,000 of 300,000 steps: the same command continues from there'
-    """
+    """A loop was asked to stop, and has saved its state."""
 
     @classmethod
     def at(
         cls, done: int, total: int, unit: str = "steps", *, part: str = "", most: bool = False
     ) -> Interrupted:
-        """The exception with the sentence that tells the user where the run stands.
+        """The exception, with a message that says how far the run is.
 
         Args:
-            done: how much is done and saved.
-            total: how much there is to do.
-            unit: what is counted.
-            part: the part of the run that was interrupted, such as "the player's training".
-            most: says that the part may end before ``total``.
+            done: steps done and saved.
+            total: steps of the whole part.
+            unit: what a step is called.
+            part: the part of the run, such as "the player's training".
+            most: whether the part may end before ``total``.
 
         Examples:
+            >>> str(Interrupted.at(120_000, 300_000))
+            'interrupted at 120,000 of 300,000 steps: the same command continues from there'
             >>> str(Interrupted.at(2_000, 5_000_000, part="the player's training", most=True))
             "interrupted in the player's training at 2,000 of at most 5,000,000 steps: the same
             command continues from there"
@@ -43,11 +40,11 @@ class Interrupted(KeyboardInterrupt):
 
 
 class Interrupt:
-    """Turns the first SIGINT or SIGTERM into a flag that a loop polls where it is safe to save.
+    """Turns the first SIGINT or SIGTERM into a flag, which a loop polls where it can save.
 
     The second signal raises KeyboardInterrupt at once. Handlers are installed in the main thread
-    only, and put back at the end; a signal that the process was started to ignore stays ignored.
-    Inside another Interrupt, the outer one's flag is shared, so one Ctrl-C stops all loops.
+    only, and restored at the end. A signal that the process ignores stays ignored. Nested ones
+    share the flag of the outermost, so that one Ctrl-C stops all loops.
 
     Examples:
         >>> with Interrupt() as interrupt:
@@ -69,7 +66,7 @@ class Interrupt:
 
     @property
     def requested(self) -> bool:
-        """True once a signal has come."""
+        """Whether a signal has arrived."""
         return self._requested if self._shared is None else self._shared.requested
 
     def __enter__(self) -> Interrupt:
@@ -85,12 +82,7 @@ class Interrupt:
                     signal.signal(number, self._handle)
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *raised: object) -> None:
         self._requested, self._shared = self.requested, None
         if Interrupt._outer is self:
             Interrupt._outer = None
@@ -102,14 +94,14 @@ class Interrupt:
         if self._requested:
             raise KeyboardInterrupt
         self._requested = True
-        # Not sys.stderr: its buffer may be in the middle of a write.
+        # Not sys.stderr: the signal may have interrupted a write to its buffer.
         os.write(2, b"\nstopping after this step; once more to stop at once without saving\n")
 
 
 def gentle_signal() -> signal.Signals:
-    """What asks a run of this process, or one below it, to save its state and stop.
+    """The signal that asks a run in this process, or in a child of it, to save and stop.
 
-    A process that was started in the background ignores SIGINT, and so do its children.
+    A shell starts background processes with SIGINT ignored, and children inherit that.
     """
     ignored = signal.getsignal(signal.SIGINT) in (signal.SIG_IGN, None)
     return signal.SIGTERM if ignored else signal.SIGINT

@@ -1,27 +1,23 @@
-"""A run's measurements: one JSON object a line, as they come."""
+"""``metrics.jsonl``: a run's measurements, one JSON object a line."""
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import math
 import os
-import zlib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any
 
-from giril_rl.errors import INTERRUPTED, UserError
 from giril_rl.files.disk import name_file, write_atomically
 from giril_rl.files.untrusted import parse_json
 
 METRICS = "metrics.jsonl"
-"""The file of a run's folder that has them."""
-LoggerName = Literal["tensorboard", "csv", "wandb", "mlflow"]
+"""The file's name in a run's folder."""
 
 
 def read_metrics(path: Path) -> list[dict[str, Any]]:
-    r"""The rows of a ``metrics.jsonl``, oldest first; a line that a kill cut short is left out.
+    r"""The rows of a ``metrics.jsonl``, oldest first; a line cut short by a kill is skipped.
 
     Examples:
         >>> import tempfile
@@ -44,7 +40,7 @@ def read_metrics(path: Path) -> list[dict[str, Any]]:
 
 
 class MetricsFile:
-    """Appends rows to ``metrics.jsonl``; each is on disk when :meth:`write` returns.
+    """Appends rows to ``metrics.jsonl``; each is in the file when :meth:`write` returns.
 
     Examples:
         >>> import tempfile
@@ -62,7 +58,7 @@ class MetricsFile:
             self._rewrite(read_metrics(path))
 
     def write(self, phase: str, step: int, values: Mapping[str, float]) -> None:
-        """Append one row. JSON has no NaN or infinity: they become null."""
+        """Append one row. NaN and infinity, which JSON does not have, become null."""
         row: dict[str, Any] = {"phase": phase, "step": int(step)}
         for key, value in values.items():
             number = float(value)
@@ -75,7 +71,7 @@ class MetricsFile:
             raise
 
     def truncate(self, phase: str, step: int) -> None:
-        """Drop the rows of ``phase`` later than ``step``, and a line that a kill cut short."""
+        """Drop the rows of ``phase`` after ``step``, and a line cut short by a kill."""
         if self.path.exists():
             rows = read_metrics(self.path)
             self._rewrite([r for r in rows if r.get("phase") != phase or r["step"] <= step])
@@ -85,78 +81,7 @@ class MetricsFile:
 
 
 def _ends_a_line(path: Path) -> bool:
-    """Whether a file's last byte is a newline; nothing else of it is read."""
+    """Whether the last byte is a newline; reads only that byte."""
     with open(path, "rb") as file:
         file.seek(max(os.fstat(file.fileno()).st_size - 1, 0))
         return file.read() == b"\n"
-
-
-def check_logger(name: str | None) -> None:
-    """Refuse an unknown logger, or one whose package is missing, before any work is done.
-
-    Raises:
-        UserError: naming the choices, or what to install.
-
-    Examples:
-        >>> check_logger("paper")
-        Traceback (most recent call last):
-        ...
-        giril_rl.errors.UserError: logger=paper is unknown: choose tensorboard, csv, wandb, ...
-    """
-    if name is None:
-        return
-    if name not in get_args(LoggerName):
-        choices = ", ".join(get_args(LoggerName))
-        raise UserError(f"logger={name} is unknown: choose {choices} or null.")
-    if name != "csv" and importlib.util.find_spec(name) is None:
-        raise UserError(
-            f'logger={name} needs the package {name}: pip install "giril-rl[loggers]", '
-            "or choose logger=csv or logger=null."
-        )
-
-
-def make_logger(name: LoggerName, folder: Path) -> Any:
-    """What writes the measurements of one run, of which a process may have several at a time.
-
-    TensorBoard files are in ``folder/tensorboard``, CSV files in ``folder/csv``, both of TorchRL's
-    loggers; Weights & Biases and MLflow name the run after the folder. A resumed run continues the
-    same run of either, which is known by the folder's path.
-
-    Returns:
-        An object with TorchRL's ``log_metrics(values, step)``, to be ended by :func:`end_logger`.
-    """
-    check_logger(name)
-    place = folder.resolve()
-    identity = f"{place.name}-{zlib.crc32(str(place).encode()):08x}"
-    if name == "mlflow":
-        from giril_rl.runs.mlflow_run import MLflowRun
-
-        return MLflowRun(folder / name, folder.name, identity)
-    from torchrl.record.loggers.utils import get_logger
-
-    if name in ("tensorboard", "csv"):
-        return get_logger(name, str(folder / name), "")
-    wandb_kwargs = {
-        "project": "giril_rl",
-        "id": identity,
-        "resume": "allow",
-        # Else the run that is open in this process would be handed out again.
-        "reinit": "create_new",
-    }
-    return get_logger(name, str(folder / name), folder.name, wandb_kwargs=wandb_kwargs)
-
-
-def end_logger(logger: Any, error: BaseException | None = None) -> None:
-    """Ends what :func:`make_logger` began.
-
-    Args:
-        logger: what it returned.
-        error: why the run ended before its time, if it did.
-    """
-    stopped = isinstance(error, KeyboardInterrupt)
-    if hasattr(logger, "end"):
-        logger.end("FINISHED" if error is None else "KILLED" if stopped else "FAILED")
-    elif hasattr(logger.experiment, "finish"):
-        logger.experiment.finish(exit_code=0 if error is None else INTERRUPTED if stopped else 1)
-    elif hasattr(logger.experiment, "close"):
-        logger.experiment.close()

@@ -1,4 +1,9 @@
-"""Trained modules as a folder of weights and a card, to be loaded anywhere."""
+"""Sharing a trained module as a folder of weights and a card.
+
+``huggingface_hub.PyTorchModelHubMixin`` writes a similar folder. We do not use it: it knows only
+one constructor of a class, has no format number and no refusal in one sentence, and would be one
+more dependency for two small files.
+"""
 
 from __future__ import annotations
 
@@ -13,25 +18,27 @@ from torch import nn
 from torchrl.data import Bounded, Categorical, OneHot, TensorSpec
 
 from giril_rl.errors import UserError
-from giril_rl.files.disk import installed_versions, read_json, remove_leftovers, write_json
-from giril_rl.files.formats import check_format
+from giril_rl.files.disk import read_json, remove_leftovers, write_json
+from giril_rl.files.untrusted import check_format
 from giril_rl.networks.action_bounds import single_action_spec
+from giril_rl.runs.checkpoint import load_state, save_state
+from giril_rl.runs.machine import installed_versions
 
 FORMAT_VERSION = 1
 WEIGHTS = "model.safetensors"
 CARD = "card.json"
 MOST_ENTRIES = 10_000
-"""Of a list in a card; each layer of a network is one."""
+"""The longest list that a card may hold; a list may become the layers of a network."""
 
 Constructor = Callable[..., Any]
 
 
 def remembered(constructor: Constructor) -> Constructor:
-    """Decorates a constructor whose arguments are then kept for :class:`Pretrained`.
+    """Decorates a constructor so that :class:`Pretrained` knows its arguments.
 
     Args:
         constructor: an ``__init__``, or the function of a classmethod that makes an instance. Its
-            arguments are numbers, texts, lists, keys and action specs.
+            arguments may be numbers, strings, lists, nested keys and action specs.
     """
     signature = inspect.signature(constructor)
 
@@ -50,21 +57,22 @@ def remembered(constructor: Constructor) -> Constructor:
 class Pretrained:
     """Gives a module ``save_pretrained`` and ``from_pretrained``.
 
-    The folder holds ``model.safetensors`` and ``card.json``, as model hubs expect them: copy it, or
-    upload it. Neither file can run code: the card names one of the class's own constructors
-    and its arguments, which are numbers, texts and lists.
+    The folder holds ``model.safetensors`` and ``card.json``. Neither can run code: the card names
+    one of the class's own constructors that are :func:`remembered`, and plain arguments for it.
 
     Examples:
         >>> import tempfile
-        >>> from giril_rl.rewards import GenerativeReward
-        >>> spec = Bounded(-1, 1, shape=(1,))
-        >>> reward = GenerativeReward.for_vectors(2, spec, normalise="raw")
-        >>> folder = reward.save_pretrained(Path(tempfile.mkdtemp()) / "mine", {"task": "cart"})
-        >>> again = GenerativeReward.from_pretrained(folder)
-        >>> torch.equal(again.decoder[0].weight, reward.decoder[0].weight)
+        >>> class Affine(Pretrained, nn.Linear):
+        ...     @remembered
+        ...     def __init__(self, size: int) -> None:
+        ...         super().__init__(size, size)
+        >>> affine = Affine(3)
+        >>> folder = affine.save_pretrained(Path(tempfile.mkdtemp()) / "mine", {"task": "cart"})
+        >>> torch.equal(Affine.from_pretrained(folder).weight, affine.weight)
         True
-        >>> read_json(folder / "card.json")["task"]
-        'cart'
+        >>> card = read_json(folder / "card.json")
+        >>> card["task"], card["made_by"]["arguments"]
+        ('cart', {'size': 3})
     """
 
     _made_by: tuple[str, dict[str, Any]] | None = None
@@ -72,30 +80,28 @@ class Pretrained:
 
     @property
     def card_format(self) -> int:
-        """The format of this module's card; a card of an older one means another module."""
+        """The card format of this module; a card with an older one describes another module."""
         return FORMAT_VERSION
 
     @property
     def made_with(self) -> dict[str, Any]:
-        """The arguments of the constructor that made it, as a card has them; empty if none did."""
+        """The constructor's arguments as in a card; empty if it was not :func:`remembered`."""
         return {key: plain(value) for key, value in (self._made_by or ("", {}))[1].items()}
 
     def save_pretrained(self, folder: Path | str, card: Mapping[str, Any] | None = None) -> Path:
-        """Writes weights and card, replacing what an earlier call wrote.
+        """Write weights and card, replacing earlier ones.
 
         Args:
-            folder: made if need be.
-            card: what else the card is to say, such as method, task and scores; JSON values.
+            folder: the folder, which may not exist yet.
+            card: more entries for the card, such as method, task and scores; JSON values.
 
         Returns:
             The folder.
 
         Raises:
-            UserError: if the module was put together by hand rather than by one of its
-                constructors, so that a card could not say how to make it again.
+            UserError: if the module was made of networks passed in by hand, which a card cannot
+                describe.
         """
-        from giril_rl.files.checkpoint import save_state
-
         if self._made_by is None:
             raise UserError(
                 f"this {type(self).__name__} was made of networks of your own, which a card cannot "
@@ -117,13 +123,11 @@ class Pretrained:
 
     @classmethod
     def from_pretrained(cls, folder: Path | str) -> Self:
-        """The module that :meth:`save_pretrained` wrote, in eval mode, on the CPU.
+        """Load a module that :meth:`save_pretrained` wrote, in eval mode, on the CPU.
 
         Raises:
-            UserError: in one sentence, if the folder holds something else or is damaged.
+            UserError: if the folder holds something else or is damaged.
         """
-        from giril_rl.files.checkpoint import load_state
-
         folder = Path(folder)
         if not (folder / CARD).is_file() or not (folder / WEIGHTS).is_file():
             raise UserError(
@@ -133,7 +137,7 @@ class Pretrained:
         unfitting = UserError(
             f"{folder / WEIGHTS} does not fit its card: the two belong to different modules."
         )
-        # A card may ask for a network of any size, so that it is made without memory first.
+        # A card may ask for a network of any size: first make it without memory.
         if _shapes(cls._remade(folder / CARD, "meta").state_dict()) != _shapes(weights):
             raise unfitting
         module = cls._remade(folder / CARD, "cpu")
@@ -162,10 +166,10 @@ class Pretrained:
             )
         constructor = _constructor(cls, made_by.get("constructor"))
         try:
-            arguments = {key: _spoken(value) for key, value in made_by["arguments"].items()}
+            arguments = {key: _from_plain(value) for key, value in made_by["arguments"].items()}
             with torch.device(device):
                 made = constructor(**arguments)
-        except Exception as error:  # Arguments of any kind and size raise nearly anything.
+        except Exception as error:  # Wrong arguments can raise anything.
             reason = " ".join(str(error).split())[:200]
             raise UserError(
                 f"{path} says of its {cls.__name__} what cannot be made ({reason}): restore a copy."
@@ -183,7 +187,7 @@ def _shapes(state: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _constructor(cls: type, name: Any) -> Constructor:
-    """One of the class's own decorated constructors, and nothing else."""
+    """The class's own constructor of that name, if it is :func:`remembered`."""
     if name == "__init__" and hasattr(vars(cls).get("__init__"), "__wrapped__"):
         return cls
     found = getattr(cls, name, None) if isinstance(name, str) and name.isidentifier() else None
@@ -193,7 +197,7 @@ def _constructor(cls: type, name: Any) -> Constructor:
 
 
 def plain(value: Any) -> Any:
-    """A constructor's argument as the JSON value that a card has of it.
+    """A constructor's argument as JSON.
 
     Examples:
         >>> plain(Categorical(3, shape=(16,))), plain(("next", "observation"))
@@ -218,7 +222,8 @@ def _plain_spec(value: TensorSpec) -> dict[str, Any]:
     return {"action_spec": "box", "low": low, "high": high}
 
 
-def _spoken(value: Any) -> Any:
+def _from_plain(value: Any) -> Any:
+    """The inverse of :func:`plain`."""
     if isinstance(value, list) and len(value) > MOST_ENTRIES:
         raise ValueError(f"a list of {len(value):,} entries")
     if isinstance(value, dict):
@@ -228,12 +233,12 @@ def _spoken(value: Any) -> Any:
             return Bounded(low, high, shape=low.shape, dtype=torch.float32)
         return {"discrete": Categorical, "one_hot": OneHot}[kind](int(value["n"]))
     if isinstance(value, list):
-        return tuple(_spoken(entry) for entry in value)
+        return tuple(_from_plain(entry) for entry in value)
     return value
 
 
 def made_class(folder: Path | str) -> str | None:
-    """The name of the class that a folder's card is of, None where it has none."""
+    """The class named in a folder's card, None if there is none."""
     path = Path(folder) / CARD
     made_by = read_json(path).get("made_by") if path.is_file() else None
     name = made_by.get("class") if isinstance(made_by, dict) else None

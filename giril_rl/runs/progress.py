@@ -1,29 +1,41 @@
-"""A progress bar for a terminal, and now and then a line for a log."""
+"""Progress: tqdm's bar in a terminal, one whole line now and then in a log."""
 
 from __future__ import annotations
 
 import sys
-import time
-from types import TracebackType
 from typing import Any, TextIO
 
 from tqdm import tqdm
 
 
-class progress:
-    """Steps done, steps per second and time left, on the standard error stream.
+class _Lines:
+    """A stream for tqdm that turns each refresh of the bar into a line of its own."""
 
-    A terminal gets a bar. Anything else, such as a file or a batch system's log, gets one whole
-    line at most every ``interval`` seconds, and nothing at all for work shorter than that.
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+
+    def write(self, text: str) -> None:
+        if text.strip():
+            self._stream.write(f"{text.strip()}\n")
+
+    def flush(self) -> None:
+        self._stream.flush()
+
+
+class progress(tqdm):
+    """A progress bar with the rate and the time left.
+
+    A terminal gets tqdm's bar. Any other stream, such as a file or a batch system's log, gets one
+    line at most every ``interval`` seconds, and nothing for work shorter than that.
 
     Args:
-        total: steps of the whole work, including those of an earlier process.
-        initial: steps done before this process began; they count for the bar, not for the speed.
+        total: steps of the whole work, those of earlier processes included.
+        initial: steps done by earlier processes; they count in the bar but not in the rate.
         desc: the work's name.
         unit: what a step is called.
-        interval: seconds between lines without a terminal.
-        stream: where to write; None takes ``sys.stderr``.
-        disable: write nothing and only count.
+        interval: seconds between two lines if there is no terminal.
+        stream: where to write; None is ``sys.stderr``.
+        disable: only count, in ``n``.
 
     Examples:
         >>> import io
@@ -31,8 +43,11 @@ class progress:
         >>> with progress(400, 100, "policy", interval=0.0, stream=log) as bar:
         ...     bar.update(300, loss=0.25)
         >>> print(log.getvalue())  # doctest: +ELLIPSIS
+        policy: 25%|...| 100/400 [...steps/s]
         policy: 100%|...| 400/400 [...steps/s, loss=0.25]...
     """
+
+    monitor_interval = 0  # No thread: with miniters=1 each update looks at the clock.
 
     def __init__(
         self,
@@ -45,69 +60,28 @@ class progress:
         stream: TextIO | None = None,
         disable: bool = False,
     ) -> None:
-        self.total, self.initial, self.done = total, initial, initial
-        self.desc, self.unit, self.interval = desc, f" {unit}", interval
-        self.stream = sys.stderr if stream is None else stream
-        self._postfix: dict[str, Any] = {}
-        self._began = self._written = time.monotonic()
-        self._last_done = initial
-        self._lines = 0
-        self._disable = disable
-        self._bar: tqdm | None = None
-        if self.stream.isatty() and not disable:
-            self._bar = tqdm(
-                total=total,
-                initial=initial,
-                desc=desc,
-                unit=self.unit,
-                file=self.stream,
-                dynamic_ncols=True,
-            )
+        stream = sys.stderr if stream is None else stream
+        self._is_log = not stream.isatty()
+        form: dict[str, Any] = (
+            {"file": _Lines(stream), "mininterval": interval, "delay": interval}
+            | {"ncols": 100, "ascii": True, "smoothing": 0}  # The average rate.
+            if self._is_log
+            else {"file": stream, "dynamic_ncols": True}
+        )
+        form |= {"desc": desc, "unit": f" {unit}", "miniters": 1}
+        super().__init__(total=total, initial=initial, disable=disable, **form)
 
     def update(self, steps: int = 1, **values: float | str) -> None:
-        """Count ``steps`` more and show ``values`` (such as a loss) behind the speed."""
-        self.done += steps
-        self._postfix.update(values)
-        if self._bar is not None:
-            if values:
-                self._bar.set_postfix(self._postfix, refresh=False)
-            self._bar.update(steps)
-        elif not self._disable and time.monotonic() - self._written >= self.interval:
-            self._write_line()
+        """Count ``steps`` more and show ``values``, such as a loss, after the rate."""
+        if self.disable:
+            self.n += steps
+            return
+        if values:
+            self.set_postfix(values, refresh=False)
+        super().update(steps)
 
     def close(self) -> None:
-        """End the bar, or write the last line if there was any before."""
-        if self._bar is not None:
-            self._bar.close()
-            self._bar = None
-        elif self._lines and self._last_done != self.done:
-            self._write_line()
-
-    def _write_line(self) -> None:
-        now = time.monotonic()
-        line = tqdm.format_meter(
-            self.done,
-            self.total,
-            now - self._began,
-            ncols=100,
-            prefix=self.desc,
-            ascii=True,
-            unit=self.unit,
-            postfix=", ".join(f"{key}={value}" for key, value in self._postfix.items()) or None,
-            initial=self.initial,
-        )
-        self.stream.write(f"{line}\n")
-        self.stream.flush()
-        self._written, self._last_done = now, self.done
-        self._lines += 1
-
-    def __enter__(self) -> progress:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
+        """End the bar; a log gets a last line unless it has that line already."""
+        if self._is_log and not self.disable and self.n == self.last_print_n:
+            self.leave = False
+        super().close()

@@ -1,4 +1,4 @@
-"""Random numbers: seeds for each use, and the state of torch's global generators."""
+"""Random numbers: a seed for each use, and the state of torch's global generators."""
 
 from __future__ import annotations
 
@@ -10,8 +10,6 @@ from typing import Literal, get_args
 import torch
 from torch import Tensor
 
-from giril_rl.errors import UserError
-
 CPU = torch.device("cpu")
 Use = Literal["player", "demonstration", "training", "evaluation", "reward"]
 _USES = get_args(Use)
@@ -20,13 +18,13 @@ _USES = get_args(Use)
 def stream_seed(use: Use, *numbers: int, bits: int = 63) -> int:
     """A seed for one use, never equal to a seed for another use.
 
-    The first three of the seed's bits are the use; the others are hashed from use and numbers. So
-    with the same ``seed`` in a run's settings the player, its demonstration, the policy's training,
-    its evaluation and the reward model all have random numbers and start states of their own.
+    The first three bits are the use, the others a hash of use and numbers. So one run's ``seed``
+    gives the player, its demonstration, the policy's training, its evaluation and the reward model
+    random numbers and start states of their own.
 
     Args:
         use: what the random numbers are for.
-        numbers: what tells the seeds of one use apart, such as a run's seed.
+        numbers: tell the seeds of one use apart, such as the run's seed.
         bits: size of the seed: 63 for torch, 32 for simulators.
 
     Examples:
@@ -43,7 +41,7 @@ def stream_seed(use: Use, *numbers: int, bits: int = 63) -> int:
 
 
 def rng_state(device: torch.device) -> dict[str, Tensor]:
-    """The generators' states, for a checkpoint.
+    """The state of torch's generators on the CPU and on ``device``, for a checkpoint.
 
     Examples:
         >>> list(rng_state(torch.device("cpu")))
@@ -57,7 +55,7 @@ def rng_state(device: torch.device) -> dict[str, Tensor]:
 
 @contextmanager
 def seeded(seed: int, device: torch.device = CPU) -> Iterator[None]:
-    """Seeds the generators of the CPU and of ``device``, and puts them back afterwards.
+    """Seed the generators of the CPU and of ``device``; restore their state afterwards.
 
     Examples:
         >>> state = torch.get_rng_state()
@@ -79,23 +77,7 @@ def seeded(seed: int, device: torch.device = CPU) -> Iterator[None]:
 
 
 def restore_rng(state: dict[str, Tensor]) -> None:
-    """Puts back what :func:`rng_state` gave."""
+    """Set torch's generators to a state from :func:`rng_state`."""
     torch.set_rng_state(state["cpu"])
     if "cuda" in state:
         torch.cuda.set_rng_state(state["cuda"])
-
-
-def check_device(device: str) -> None:
-    """Refuses a device that is not there, before anything is made.
-
-    Raises:
-        UserError: in one sentence.
-
-    Examples:
-        >>> check_device("cpu")
-    """
-    if device == "cuda" and not torch.cuda.is_available():
-        raise UserError(
-            "device=cuda, and torch sees no GPU here: leave device=cpu, or install a CUDA build of "
-            "torch."
-        )

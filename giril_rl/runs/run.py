@@ -1,4 +1,4 @@
-"""A run is a folder: resolved config, versions, metrics as they come, checkpoints, the result."""
+"""A run is a folder: config, versions, metrics, checkpoints and, in the end, the result."""
 
 from __future__ import annotations
 
@@ -7,15 +7,16 @@ import json
 import warnings
 from collections.abc import Collection, Mapping
 from pathlib import Path
-from types import TracebackType
 from typing import Any, TypeVar
 
 import yaml
 from filelock import FileLock, Timeout
 
+from giril_rl.config.leaves import flat
 from giril_rl.errors import UserError, told
 from giril_rl.files.disk import (
-    installed_versions,
+    cannot_write,
+    check_place,
     missing,
     name_file,
     read_json,
@@ -23,39 +24,38 @@ from giril_rl.files.disk import (
     write_atomically,
     write_json,
 )
-from giril_rl.files.formats import RUN_FORMAT, check_run_format
-from giril_rl.runs.naming import NO_EFFECT, without_added
-from giril_rl.files.places import cannot_write, check_place
-from giril_rl.config.leaves import flat
-from giril_rl.runs.sources import sources_of
-from giril_rl.files.checkpoint import load_state, save_state
-from giril_rl.runs.metrics import METRICS, MetricsFile, check_logger, end_logger, make_logger
 from giril_rl.files.untrusted import parse_yaml, read_text
+from giril_rl.runs.checkpoint import load_state, save_state
+from giril_rl.runs.finished import RUN_FORMAT, check_run_format
+from giril_rl.runs.identity import NO_EFFECT, differences, sources_of
+from giril_rl.runs.loggers import check_logger, end_logger, make_logger
+from giril_rl.runs.machine import installed_versions
+from giril_rl.runs.metrics import METRICS, MetricsFile
 
 FIRST_FILES = ("config.yaml", "versions.json")
-"""What a run's folder holds before its first part has come to anything."""
+"""The files of a run's folder before anything was learned."""
 Closable = TypeVar("Closable")
 
 
 class Run:
-    """One run's folder, held by one process at a time; made and continued with :meth:`open`.
+    """One run's folder, used by one process at a time; :meth:`open` makes or continues it.
 
     ========================  ====================================================================
-    ``config.yaml``           the resolved configuration, with the recipe's name
-    ``versions.json``         the format of the folder, Python and the packages that decide the
-                              numbers, and digests of the user's own code, see
-                              :mod:`giril_rl.runs.sources`
+    ``config.yaml``           the resolved settings and the recipe's name
+    ``versions.json``         the folder's format, the versions of Python and of the packages that
+                              decide the numbers, and digests of the user's own code, see
+                              :func:`giril_rl.runs.identity.sources`
     ``metrics.jsonl``         measurements, one JSON object a line
-    ``NAME.safetensors``      checkpoints, see :func:`giril_rl.files.checkpoint.save_state`
-    ``result.json``           written last; where it is, the run is finished
+    ``NAME.safetensors``      checkpoints, see :mod:`giril_rl.runs.checkpoint`
+    ``result.json``           written last: a run that has it is finished
     ========================  ====================================================================
 
     Attributes:
         folder: the folder.
         recipe: the recipe's name.
-        config: the resolved configuration, as given.
-        versions: what ``versions.json`` holds.
-        fit_seconds: what fitting reward models took, earlier processes included.
+        config: the resolved settings, as given.
+        versions: versions of Python and of the packages that decide the numbers.
+        fit_seconds: seconds of fitting before the policy learns, earlier processes included.
 
     Examples:
         >>> import tempfile
@@ -95,14 +95,14 @@ class Run:
         logger: str | None = None,
         ignore: Collection[str] = NO_EFFECT,
     ) -> Run:
-        """Make a run's folder, or open it again to continue; use the result in a ``with``.
+        """Make a run's folder, or open it to continue; use it in a ``with``.
 
         Args:
-            folder: the folder, made if need be.
-            config: the resolved configuration, of plain dicts, lists and scalars.
-            recipe: the recipe's name, which belongs to the configuration.
+            folder: the folder, which may not exist yet.
+            config: the resolved settings: plain dictionaries, lists and scalars.
+            recipe: the recipe's name, saved with the settings.
             logger: "tensorboard", "csv", "wandb" or "mlflow", beside ``metrics.jsonl``.
-            ignore: dotted keys that may differ from the ones that the run was made with.
+            ignore: dotted keys whose values may differ from those the run was made with.
 
         Raises:
             UserError: if the folder holds something else, was made with other settings or is in
@@ -122,7 +122,7 @@ class Run:
                 "or choose another out=."
             ) from None
         except OSError as error:
-            if told(error) is not error:  # A disk that failed is no bad choice of a place.
+            if told(error) is not error:  # A failing disk is not a bad choice of out=.
                 raise
             raise cannot_write(run.folder, "out=", error) from None
         try:
@@ -139,26 +139,23 @@ class Run:
         return run
 
     def closing(self, part: Closable) -> Closable:
-        """``part`` itself, closed at the latest with the run, however that ends.
+        """``part`` itself, such as an environment, to be closed with the run, however that ends.
 
         Examples:
             >>> import tempfile
-            >>> from giril_rl.config.schema import TaskConfig
-            >>> from giril_rl.envs import make_env
-            >>> task = TaskConfig(name="cartpole", env_id="CartPole-v1")
             >>> with Run.open(tempfile.mkdtemp(), {}, recipe="mine") as run:
-            ...     env = run.closing(make_env(task, num_envs=1, seed=0))
-            >>> env.is_closed
+            ...     file = run.closing(open(run.folder / "notes.txt", "w"))
+            >>> file.closed
             True
         """
         self._open_parts.callback(_close, part)
         return part
 
     def log(self, step: int, values: Mapping[str, float], *, phase: str) -> None:
-        """Append one row to ``metrics.jsonl``, and to the logger if there is one.
+        """Append a row to ``metrics.jsonl``, and to the logger if there is one.
 
         Args:
-            step: the phase's own count, such as environment steps; resuming goes by it.
+            step: the phase's own count, such as environment steps.
             values: measurements, with their group in the key, such as ``"ppo/loss"``.
             phase: the part of the run, such as ``"fit"`` or ``"ppo"``.
         """
@@ -174,24 +171,24 @@ class Run:
             raise
 
     def truncate_metrics(self, phase: str, step: int) -> None:
-        """Forget the rows of ``phase`` later than ``step``, before continuing from there.
+        """Drop the rows of ``phase`` after ``step``, before continuing from there.
 
-        What a logger such as TensorBoard has already shown stays there.
+        Loggers such as TensorBoard keep what they have.
         """
         self._metrics.truncate(phase, step)
 
     def save(self, name: str, state: dict[str, Any]) -> None:
-        """Save the checkpoint ``name``, replacing its predecessor at once."""
+        """Save the checkpoint ``name``, replacing the previous one atomically."""
         save_state(self.folder / f"{name}.safetensors", state)
 
     def load(self, name: str) -> dict[str, Any] | None:
-        """The checkpoint ``name``, or None if there is none yet."""
+        """The checkpoint ``name``, or None if there is none."""
         path = self.folder / f"{name}.safetensors"
         return load_state(path) if path.exists() else None
 
     @property
     def result(self) -> dict[str, Any] | None:
-        """What :meth:`finish` wrote, or None while the run is not finished."""
+        """What :meth:`finish` wrote, or None if the run is not finished."""
         path = self.folder / "result.json"
         return read_json(path) if path.exists() else None
 
@@ -205,12 +202,12 @@ class Run:
         write_json(self.folder / "result.json", result)
 
     def close(self, error: BaseException | None = None) -> None:
-        """End the logger's run and let another process have the folder.
+        """Close parts and logger, and release the folder.
 
-        A run that was refused before anything came of it leaves no folder.
+        A run that a UserError ended before anything was learned leaves no folder.
 
         Args:
-            error: why the run ended before its time, if it did.
+            error: why the run stopped early, if it did.
         """
         logger, self._logger = self._logger, None
         try:
@@ -231,13 +228,8 @@ class Run:
     def __enter__(self) -> Run:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close(error)
+    def __exit__(self, *raised: Any) -> None:
+        self.close(raised[1])
 
     def _refuse_foreign_folder(self) -> None:
         if not self.folder.exists() or (self.folder / "config.yaml").exists():
@@ -254,7 +246,7 @@ class Run:
             )
 
     def _written_config(self) -> dict[str, Any]:
-        # Through JSON, so that tuples and lists compare equal, as they do once written.
+        # JSON makes tuples into lists, as they are once written.
         return json.loads(json.dumps({"recipe": self.recipe, **self.config}))
 
     def _compare_config(self, ignore: Collection[str]) -> None:
@@ -267,16 +259,16 @@ class Run:
             before = None
         if not isinstance(before, dict):
             raise UserError(f"{path} cannot be read: choose another out=, or delete the folder.")
-        differences = _differences(before, self._written_config(), ignore)
-        if differences:
-            more = f" and {len(differences) - 3} more" if len(differences) > 3 else ""
+        changed = differences(before, self._written_config(), ignore)
+        if changed:
+            more = f" and {len(changed) - 3} more" if len(changed) > 3 else ""
             raise UserError(
-                f"{self.folder} was made with other settings ({'; '.join(differences[:3])}{more}): "
+                f"{self.folder} was made with other settings ({'; '.join(changed[:3])}{more}): "
                 "choose another out=, or delete the folder."
             )
 
     def _write_config(self) -> None:
-        """An unfinished run goes on with the settings of now, where they may differ."""
+        """An unfinished run continues with the new values of keys that may differ."""
         path = self.folder / "config.yaml"
         config = self._written_config()
         if path.exists():
@@ -287,7 +279,7 @@ class Run:
         write_atomically(path, yaml.safe_dump(config, sort_keys=False))
 
     def _check_checkpoints(self) -> None:
-        """A damaged one is refused now, not when its part's turn has come."""
+        """Refuse a damaged checkpoint now, not hours later when it is needed."""
         if not self.finished:
             for path in sorted(self.folder.glob("*.safetensors")):
                 load_state(path)
@@ -295,7 +287,7 @@ class Run:
     def _write_versions(self) -> None:
         path = self.folder / "versions.json"
         if self.finished and path.exists():
-            return  # What is only looked at was not made with these versions.
+            return  # These versions did not make it.
         before = read_json(path) if path.exists() else self.versions
         known = before.get("sources")
         sources = {**(known if isinstance(known, dict) else {}), **sources_of(self.folder)}
@@ -311,18 +303,5 @@ class Run:
 
 
 def _close(part: Any) -> None:
-    if not getattr(part, "is_closed", False):  # An environment of TorchRL's, closed by a collector.
+    if not getattr(part, "is_closed", False):  # TorchRL's collectors close environments too.
         part.close()
-
-
-def _differences(
-    before: Mapping[str, Any], now: Mapping[str, Any], ignore: Collection[str]
-) -> list[str]:
-    """``"ppo.lr: 0.1 there, 0.2 now"`` for each dotted key whose values differ."""
-    old, new = (flat(without_added(config), keep_empty=True) for config in (before, now))
-    return [
-        f"{key}: {old.get(key, 'nothing')!s} there, {new.get(key, 'nothing')!s} now"
-        for key in [*new, *(key for key in old if key not in new)]
-        if not any(key == name or key.startswith(f"{name}.") for name in ignore)
-        and (key not in old or key not in new or old[key] != new[key])
-    ]

@@ -1,25 +1,31 @@
-"""The loops that recipes share: fit a reward, PPO on a reward, score, keep and resume."""
+"""What recipes compose: a demonstration, reward training, the training loop, scores."""
 
-from giril_rl.policies.agent import load_agent, make_agent
+from giril_rl.policies import load_agent, make_agent
 from giril_rl.runs.run import Run
-from giril_rl.training.adversarial import AdversarialLearner
-from giril_rl.training.clone import clone_behaviour
-from giril_rl.training.evaluate import Scores, evaluate, evaluate_both
-from giril_rl.training.expert import check_inputs, check_task, obtain_demonstration, train_expert
-from giril_rl.training.fit import fit_reward
-from giril_rl.training.held_action import HeldAction, check_discrete, held_action_scores
-from giril_rl.training.ppo import PPOLearner, Trained, train_ppo
-from giril_rl.training.random_policy import RandomPolicy
+from giril_rl.training.algorithm import Algorithm
+from giril_rl.training.baselines import (
+    HeldAction,
+    RandomPolicy,
+    check_discrete,
+    held_action_scores,
+)
+from giril_rl.training.cloning import clone_behaviour
+from giril_rl.training.demonstrations import check_inputs, obtain_demonstration, open_run
+from giril_rl.training.fitting import fit_reward
+from giril_rl.training.loop import Trained, train_policy
+from giril_rl.training.players import check_task, train_expert
+from giril_rl.training.ppo import PPO, return_scaling
 from giril_rl.training.result import finish_run
-from giril_rl.training.reward_learner import RewardLearner
-from giril_rl.training.scaling import return_scaling
+from giril_rl.training.reward_trainers import AdversarialTrainer, RewardTrainer
+from giril_rl.training.scoring import Scores, evaluate, evaluate_both
 
 __all__ = [
-    "AdversarialLearner",
+    "PPO",
+    "AdversarialTrainer",
+    "Algorithm",
     "HeldAction",
-    "PPOLearner",
     "RandomPolicy",
-    "RewardLearner",
+    "RewardTrainer",
     "Run",
     "Scores",
     "Trained",
@@ -35,7 +41,8 @@ __all__ = [
     "load_agent",
     "make_agent",
     "obtain_demonstration",
+    "open_run",
     "return_scaling",
     "train_expert",
-    "train_ppo",
+    "train_policy",
 ]

@@ -6,9 +6,11 @@ import sys
 
 from giril_rl.config.schema import DemoConfig, ExpertConfig, FitConfig, RunConfig
 
-STEPS_PER_SECOND = {"player": 6_000, "reward model": 3_000, "policy": 6_000}
-"""Rough rates of one core of a server of 2023, for vectors."""
-FRAME_STEPS_PER_SECOND = {"player": 500, "reward model": 12, "policy": 500}
+STEPS_PER_SECOND = {
+    "vector": {"player": 6_000, "reward model": 3_000, "policy": 6_000},
+    "image": {"player": 500, "reward model": 12, "policy": 500},
+}
+"""Rough rates of one core of a server of 2023, by kind of observation."""
 
 
 def outlook(cfg: RunConfig, expert: ExpertConfig, demo: DemoConfig, *, has_player: bool) -> str:
@@ -27,7 +29,7 @@ def outlook(cfg: RunConfig, expert: ExpertConfig, demo: DemoConfig, *, has_playe
         player: at most 5,000,000 steps, about 2.8 h; policy: 1,000,000 steps, about 33 min (rough
         figures for one core, the bars below tell yours)
     """
-    rates = FRAME_STEPS_PER_SECOND if cfg.task.is_atari else STEPS_PER_SECOND
+    rates = STEPS_PER_SECOND[cfg.task.family.observation]
     parts = []
     if demo.path is None and expert.path is None and not has_player:
         most = expert.steps_on(cfg.task)

@@ -13,9 +13,8 @@ from filelock import FileLock, Timeout
 from giril_rl.config.imports import named_modules
 from giril_rl.config.schema import EvalConfig, TaskConfig
 from giril_rl.errors import UserError
-from giril_rl.files.disk import write_atomically, write_json
-from giril_rl.files.places import check_place
-from giril_rl.policies.agent import load_agent
+from giril_rl.files.disk import check_place, write_atomically, write_json
+from giril_rl.policies.making import load_agent
 from giril_rl.runs.finished import (
     print_both,
     read_config,
@@ -23,9 +22,8 @@ from giril_rl.runs.finished import (
     read_result,
     read_settings,
 )
-from giril_rl.training.evaluate import Player, evaluate_both
-from giril_rl.training.held_action import HELD_ACTION, HeldAction
-from giril_rl.training.random_policy import RANDOM, RandomPolicy
+from giril_rl.training.baselines import HELD_ACTION, RANDOM, HeldAction, RandomPolicy
+from giril_rl.training.scoring import Player, evaluate_both
 
 
 def evaluate_run(folder: Path, episodes: int | None = None, seed: int | None = None) -> None:

@@ -2,28 +2,25 @@
 
 from __future__ import annotations
 
-import warnings
 from datetime import UTC, datetime
 from typing import Any
 
 from torch import nn
 
-from giril_rl.config.schema import DemoConfig, RunConfig, UnaveragedRunConfig
+from giril_rl.config.schema import AveragedRunConfig, DemoConfig, RunConfig
 from giril_rl.demos import Demonstration
 from giril_rl.demos.shipped import demonstration_name
-from giril_rl.files.disk import processor
-from giril_rl.policies.agent import POLICY
-from giril_rl.policies.agents import Agent
-from giril_rl.runs.curve import write_curve
-from giril_rl.runs.losses import loss_points, write_losses
+from giril_rl.policies.agent import Agent
+from giril_rl.policies.making import POLICY
+from giril_rl.runs.curve import loss_points, write_curve, write_losses
+from giril_rl.runs.identity import config_hash
+from giril_rl.runs.machine import processor
 from giril_rl.runs.metrics import METRICS, read_metrics
-from giril_rl.runs.naming import config_hash
 from giril_rl.runs.pretrained import Pretrained
 from giril_rl.runs.run import Run
-from giril_rl.training.evaluate import evaluate_both
-from giril_rl.training.held_action import HeldAction
-from giril_rl.training.ppo import Trained
-from giril_rl.training.random_policy import RandomPolicy
+from giril_rl.training.baselines import HeldAction, RandomPolicy
+from giril_rl.training.loop import Trained
+from giril_rl.training.scoring import evaluate_both
 
 REWARD = "reward"
 """The folder of a run that holds its reward, see :class:`giril_rl.runs.pretrained.Pretrained`."""
@@ -49,7 +46,6 @@ def finish_run(
     agent: Agent | RandomPolicy | HeldAction,
     trained: Trained,
     *,
-    method: str | None = None,
     expert: dict[str, Any] | None = None,
     demo: Demonstration | None = None,
     seeds: dict[str, int] | None = None,
@@ -60,10 +56,9 @@ def finish_run(
     Args:
         run: the run's folder.
         cfg: the run's settings.
-        agent: the trained policy; or one that was not trained, of which nothing is saved but the
-            number of the action that it holds.
+        agent: the trained policy; of one that was not trained nothing is saved but the number of
+            the action that it holds.
         trained: its steps and seconds.
-        method: deprecated and not read, for a run's method is the recipe's name.
         expert: the expert's result, if there was one.
         demo: the demonstration, if there was one.
         seeds: seeds besides those of policy, evaluation, expert and demonstration.
@@ -72,20 +67,14 @@ def finish_run(
     Returns:
         What ``result.json`` holds.
     """
-    if method is not None:
-        warnings.warn(
-            "finish_run's method= is not read any more: a run's method is the name that "
-            "Run.open(recipe=...) was given.",
-            DeprecationWarning,
-            stacklevel=2,
-        )
     scores = evaluate_both(agent, cfg.task, episodes=cfg.eval.episodes, seed=cfg.eval.seed)
+    has_score = demo is not None and demo.has_rewards
     result: dict[str, Any] = {
         "method": method_name(run.recipe, cfg),
         "task": cfg.task.name,
         "profile": _profile(cfg, trained),
         "horizon": cfg.task.horizon,
-        "termination": cfg.termination,
+        "termination": getattr(cfg, "termination", "ends"),
         "seed": cfg.seed,
         "seeds": {
             "policy": cfg.seed,
@@ -100,7 +89,7 @@ def finish_run(
         "inexact_resumes": trained.inexact_resumes,
         "steps_per_second": trained.steps / max(trained.seconds, 1e-9),
         "expert_return_mean": None if expert is None else expert["return_mean"],
-        "demo_return_mean": _mean_return(demo) if demo is not None and demo.has_rewards else None,
+        "demo_return_mean": _mean_return(demo) if demo is not None and has_score else None,
         "demo": None if demo is None else _source(cfg, demo),
         "demo_id": None if demo is None else demo.demo_id,
         "demo_transitions": None if demo is None else len(demo),
@@ -108,33 +97,41 @@ def finish_run(
         "versions": run.versions,
         "processor": processor(),
         "finished_at": datetime.now(UTC).isoformat(timespec="seconds"),
+        **_untrained(agent),
     }
-    if isinstance(agent, HeldAction):
-        result["held_action"] = agent.action
-    if isinstance(agent, RandomPolicy):
-        result["random_policy"] = True
     card = {key: result[key] for key in CARD_KEYS}
-    if not isinstance(agent, (RandomPolicy, HeldAction)):
-        agent.save_pretrained(run.folder / POLICY, card)
-    if isinstance(reward, Pretrained):
-        reward.save_pretrained(run.folder / REWARD, card)
-    rows = read_metrics(run.folder / METRICS)
-    names: dict[str, Any] = {"recipe": result["method"], "task": cfg.task.name, "seed": cfg.seed}
-    if loss_points(rows):
-        write_losses(run.folder, rows, final_return=result["return_mean"], **names)
-    else:
-        write_curve(
-            run.folder,
-            rows,
-            expert_return=result["expert_return_mean"],
-            demo_return=result["demo_return_mean"],
-            final_return=result["return_mean"],
-            final_std=result["return_std"],
-            final_step=trained.steps,
-            **names,
-        )
+    for folder, module in ((POLICY, agent), (REWARD, reward)):
+        if isinstance(module, Pretrained):
+            module.save_pretrained(run.folder / folder, card)
+    _draw(run, result)
     run.finish(result)
     return result
+
+
+def _untrained(agent: nn.Module) -> dict[str, Any]:
+    """What remakes a policy that holds no weights."""
+    if isinstance(agent, HeldAction):
+        return {"held_action": agent.action}
+    return {"random_policy": True} if isinstance(agent, RandomPolicy) else {}
+
+
+def _draw(run: Run, result: dict[str, Any]) -> None:
+    """The run's picture: its losses where it was cloned, its learning curve otherwise."""
+    rows = read_metrics(run.folder / METRICS)
+    names = {"recipe": result["method"], "task": result["task"], "seed": result["seed"]}
+    if loss_points(rows):
+        write_losses(run.folder, rows, final_return=result["return_mean"], **names)
+        return
+    write_curve(
+        run.folder,
+        rows,
+        expert_return=result["expert_return_mean"],
+        demo_return=result["demo_return_mean"],
+        final_return=result["return_mean"],
+        final_std=result["return_std"],
+        final_step=result["env_steps"],
+        **names,
+    )
 
 
 def method_name(recipe: str, cfg: RunConfig) -> str:
@@ -145,15 +142,14 @@ def method_name(recipe: str, cfg: RunConfig) -> str:
         'my_recipe'
     """
     reward = getattr(cfg, "reward", None)
-    if recipe == "control" and isinstance(reward, str):
-        return f"control:{reward}"
-    return recipe
+    return f"control:{reward}" if recipe == "control" and isinstance(reward, str) else recipe
 
 
 def _profile(cfg: RunConfig, trained: Trained) -> str | None:
-    """The profile, None where it makes no difference: nothing is averaged in either."""
-    has_none = isinstance(cfg, UnaveragedRunConfig) or (cfg.batch_mean and not trained.averaged)
-    return None if has_none else cfg.profile
+    """The profile, None where it makes no difference because nothing is averaged in either."""
+    if not isinstance(cfg, AveragedRunConfig) or (cfg.batch_mean and not trained.averaged):
+        return None
+    return cfg.profile
 
 
 def _source(cfg: RunConfig, demo: Demonstration) -> str:

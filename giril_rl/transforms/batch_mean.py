@@ -1,4 +1,4 @@
-"""One reward for all environments of a step: their mean."""
+"""The mean of a step's rewards over the environments."""
 
 from __future__ import annotations
 
@@ -14,22 +14,21 @@ from giril_rl.transforms.reward_transform import RewardTransform, copied, split_
 class BatchMeanReward(RewardTransform):
     """Replaces a step's reward by its mean over the environments.
 
-    The released GIRIL code averages eq. 2 over the parallel environments as well (its
-    ``reduction="mean"``), so that a step's reward no longer tells what this environment did.
-    Kept apart from the reward so that its effect can be measured.
+    The released GIRIL code averages eq. 2 over the parallel environments too (its
+    ``reduction="mean"``), so that a reward no longer says what its own environment did. As a
+    transform of its own, the effect can be measured.
 
-    In an environment all batch dimensions are environments. In a batch, ``time_dim`` is time and
-    the other dimensions are environments; a flat batch is one environment's time and stays as it
-    is. Inside a worker of a batched environment there is one environment only, and the transform
-    refuses.
+    In an environment, all batch dimensions are environments. In a batch, ``time_dim`` is time and
+    the other dimensions are environments; a flat batch is the time of one environment and does not
+    change. The transform refuses to run inside a worker, which sees one environment only.
 
     Args:
         reward_key: the reward, without the ``"next"``.
         time_dim: which of the batch dimensions is time.
 
     Raises:
-        UserError: if there is no reward, for one of another shape than the environment's spec says,
-            and for split trajectories, which are not side by side in time.
+        UserError: if the reward is missing or does not have its spec's shape, and for split
+            trajectories, whose steps are not simultaneous.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -44,8 +43,8 @@ class BatchMeanReward(RewardTransform):
         self.time_dim = time_dim
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Averages a batch ``[N, T]`` step by step and returns it, as a shallow copy."""
-        batch, following = copied(tensordict)
+        """Averages a batch ``[N, T]`` step by step; returns a shallow copy."""
+        batch, next_td = copied(tensordict)
         if split_mask(batch) is not None:
             raise UserError(
                 "the batch holds split trajectories, whose steps are not those of one time: "
@@ -54,7 +53,7 @@ class BatchMeanReward(RewardTransform):
         dims = list(range(batch.ndim))
         if dims:
             dims.pop(self.time_dim)
-        self._average(following, self._read(following), dims)
+        self._average(next_td, self._read(next_td), dims)
         return batch
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
@@ -62,10 +61,10 @@ class BatchMeanReward(RewardTransform):
         self._average(next_tensordict, self._read_step(next_tensordict), dims)
         return next_tensordict
 
-    def _average(self, following: TensorDictBase, reward: Tensor, dims: list[int]) -> None:
+    def _average(self, next_td: TensorDictBase, reward: Tensor, dims: list[int]) -> None:
         if dims:
             mean = reward.mean(dims, keepdim=True)
-            following.set(self.reward_key, torch.empty_like(reward).copy_(mean))
+            next_td.set(self.reward_key, torch.empty_like(reward).copy_(mean))
 
     def _check_batched_worker_compat(self) -> None:
         raise UserError(

@@ -1,4 +1,4 @@
-"""Is a module a reward? What :func:`torchrl.envs.check_env_specs` is to environments."""
+"""Checks a reward module, as :func:`torchrl.envs.check_env_specs` checks an environment."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ CHECKED = "checked_reward"
 def check_reward(
     module: TensorDictModuleBase, batch: TensorDictBase, *, deterministic: bool = True
 ) -> None:
-    """Holds a reward module to what transforms and training loops rely on, on a batch of yours.
+    """Checks on a batch of yours what transforms and training loops require of a reward module.
 
-    - one float for each transition, shape ``(*batch, 1)``, all finite, whatever the batch's shape;
-    - no transition's reward depends on another's, nor on how many there are;
-    - using it changes neither its state, nor the batch, nor the global random state.
+    - It writes one finite float per transition, shape ``(*batch, 1)``, for any batch shape.
+    - A transition's reward does not depend on the other transitions or their number.
+    - Calling it changes neither its state, nor the batch, nor the global random state.
 
-    It is called by :class:`~giril_rl.transforms.IntrinsicReward`: in eval mode, without gradient.
+    :class:`~giril_rl.transforms.IntrinsicReward` calls it, in eval mode and without gradient.
 
     Args:
-        module: reads transitions and writes ``("next", "intrinsic_reward")``; left as it is.
-        batch: transitions with the module's ``in_keys``, of any leading shape, at least 3 in all.
-        deterministic: False for a reward with noise, of which equal transitions get other rewards.
-            Noise has to come from a generator of the module's own.
+        module: reads transitions and writes ``("next", "intrinsic_reward")``.
+        batch: at least 3 transitions of any leading shape, with the module's ``in_keys``.
+        deterministic: False for a reward with noise, which must come from the module's own
+            generator.
 
     Raises:
-        UserError: in one sentence, for the first thing that is wrong.
+        UserError: for the first requirement that is not met.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -47,7 +47,7 @@ def check_reward(
         Traceback (most recent call last):
         giril_rl.errors.UserError: a transition's reward depends on the others in the batch: ...
     """
-    # Not in the place of the environment's reward, which the module may read.
+    # Under a key of its own, since the module may read the environment's reward.
     relabel = IntrinsicReward(module, reward_key=CHECKED, extrinsic_key=None)
     flat = batch.select(*module.in_keys).reshape(-1)
     if len(flat) < 3:
@@ -56,7 +56,6 @@ def check_reward(
         flat = flat.set("next", TensorDict(batch_size=flat.batch_size))
 
     def rewards(data: TensorDictBase) -> Tensor:
-        """Of a copy of the data; noise goes on from where the module's generator stands."""
         return relabel(data.clone()).get(("next", CHECKED))
 
     before, given = copy.deepcopy(module.state_dict()), flat.clone()

@@ -1,8 +1,9 @@
-"""A learned reward in the place of the environment's."""
+"""Replaces the environment's reward by a learned one."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import warnings
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from itertools import chain
 
@@ -12,45 +13,54 @@ from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.data import Composite, TensorSpec, Unbounded
+from torchrl.envs import (
+    Compose,
+    NextObservationDelta,
+    ObservationNorm,
+    Transform,
+    TransformedEnv,
+    VecNorm,
+    VecNormV2,
+)
+from torchrl.record.recorder import VideoRecorder
 
 from giril_rl.errors import UserError
-from giril_rl.transforms.order import check_order
 from giril_rl.transforms.reward_transform import RewardTransform, copied, find_reward, split_mask
 
 DEFAULT_OUT_KEY: NestedKey = ("next", "intrinsic_reward")
+NORMALISERS = (ObservationNorm, VecNorm, VecNormV2)
 
 
 class IntrinsicReward(RewardTransform):
-    """Replaces the reward of each transition by what a reward module makes of it.
+    """Replaces each transition's reward by the output of a reward module.
 
-    The same numbers come out in an environment (step by step), on a batch (as a collector's
-    ``postproc``, by far the fastest) and in a replay buffer. The module may be on another device
-    than the batch: what it reads is copied there, and the reward back. It is given only its own
-    ``in_keys``, in eval mode and without gradient; of what it writes, only the reward is taken.
-    A batch is not changed: a shallow copy of it is returned, so that a replay buffer keeps what it
-    stores. Where trajectories were split and padded, the padding's reward is 0.
+    It gives the same numbers in an environment (step by step), on a batch (as a collector's
+    ``postproc``, by far the fastest) and in a replay buffer. The module gets only its own
+    ``in_keys``, in eval mode and without gradient, and only its reward is used. It may be on
+    another device than the batch. The batch does not change: a shallow copy is returned, so that a
+    replay buffer keeps what it stores. The padding of split trajectories gets reward 0.
 
-    The true reward moves to ``("next", extrinsic_key)`` and is not read. In an environment that key
-    stands in the observation spec (zero at reset), because a second reward key would break code
-    that expects one; it must then not be among a policy's ``in_keys``.
+    The true reward moves to ``("next", extrinsic_key)`` and is not read. In an environment, that
+    key is in the observation spec (zero at reset), because code that expects one reward key fails
+    with two; keep it out of a policy's ``in_keys``.
 
-    In an environment, it stands after all transforms that change observations which it reads, and
-    sees what they make of them; its action is the base environment's. Put it outside a
-    :class:`~torchrl.envs.ParallelEnv`: workers hold copies of the module, which later training of
-    the original does not reach. Copies in the environments of a multi-process collector get new
-    weights by :class:`~giril_rl.transforms.RewardWeightSyncScheme`.
+    In an environment, put it after all transforms that change observations which it reads: it sees
+    their output. It sees the base environment's action. Put it outside a
+    :class:`~torchrl.envs.ParallelEnv`, whose workers hold copies of the module that later training
+    does not reach. :class:`~giril_rl.transforms.RewardWeightSyncScheme` sends new weights to the
+    copies in a multi-process collector.
 
     Args:
         module: reads ``(s, a, s')``, e.g. ``"observation"``, ``"action"`` and
-            ``("next", "observation")``, and writes ``("next", "intrinsic_reward")``, shape
-            ``(*batch, 1)``, or the only key that it has in ``out_keys``.
+            ``("next", "observation")``; writes ``("next", "intrinsic_reward")``, shape
+            ``(*batch, 1)``, or its only ``out_keys``.
         reward_key: the environment's reward, without the ``"next"``.
         extrinsic_key: where the true reward goes, without the ``"next"``; None drops it.
 
     Raises:
         UserError: if the module's keys, the reward's key or the new reward's shape do not fit, if
-            there is something under ``extrinsic_key`` already, or if a later transform changes an
-            observation that the module reads.
+            ``extrinsic_key`` exists already, or if a later transform changes an observation that
+            the module reads.
 
     Examples:
         >>> from giril_rl.rewards import ConstantReward
@@ -79,17 +89,17 @@ class IntrinsicReward(RewardTransform):
         self.module = module
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Relabels a batch ``[N, T]`` or ``[B]`` and returns it, as a shallow copy."""
-        batch, following = copied(tensordict)
-        if self.extrinsic_key is not None and following.get(self.extrinsic_key, None) is not None:
+        """Relabels a batch ``[N, T]`` or ``[B]``; returns a shallow copy."""
+        batch, next_td = copied(tensordict)
+        if self.extrinsic_key is not None and next_td.get(self.extrinsic_key, None) is not None:
             raise UserError(
                 f"the batch has {('next', self.extrinsic_key)} already, the true reward that an "
                 "earlier relabelling kept: give the batch as it was collected, another "
                 "extrinsic_key, or extrinsic_key=None to leave that one as it is."
             )
-        true_reward = find_reward(following, self.reward_key)
+        true_reward = find_reward(next_td, self.reward_key)
         view = batch.select(*self.module.in_keys)
-        self._relabel(view, following, true_reward, split_mask(batch))
+        self._relabel(view, next_td, true_reward, split_mask(batch))
         return batch
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
@@ -106,7 +116,7 @@ class IntrinsicReward(RewardTransform):
     def _relabel(
         self,
         view: TensorDictBase,
-        following: TensorDictBase,
+        next_td: TensorDictBase,
         true_reward: Tensor | None,
         mask: Tensor | None = None,
     ) -> None:
@@ -123,7 +133,7 @@ class IntrinsicReward(RewardTransform):
             reward = find_reward(self.module(view), self._result_key)
         if reward is None:
             raise UserError(f"the reward module wrote no tensor under {self._result_key!r}.")
-        shape = (*following.batch_size, 1) if true_reward is None else tuple(true_reward.shape)
+        shape = (*next_td.batch_size, 1) if true_reward is None else tuple(true_reward.shape)
         if reward.shape != shape:
             raise UserError(
                 f"the reward module gave shape {tuple(reward.shape)} where the reward has "
@@ -139,8 +149,8 @@ class IntrinsicReward(RewardTransform):
                 mask = mask.unsqueeze(-1)
             reward = torch.where(mask, reward, 0.0)
         if self.extrinsic_key is not None:
-            following.set(self.extrinsic_key, true_reward)
-        following.set(self.reward_key, reward)
+            next_td.set(self.extrinsic_key, true_reward)
+        next_td.set(self.reward_key, reward)
 
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
@@ -151,10 +161,9 @@ class IntrinsicReward(RewardTransform):
         return tensordict_reset
 
     def train(self, mode: bool = True) -> IntrinsicReward:
-        """Sets the transform's own mode; the module's mode is its trainer's business.
+        """Sets the transform's own mode and leaves the module's to its trainer.
 
-        TorchRL puts a transform in eval mode wherever it is attached, and would stop a reward
-        module that is still being trained from training.
+        TorchRL puts every attached transform in eval mode, even while its module is trained.
         """
         self.training = mode
         return self
@@ -165,13 +174,13 @@ class IntrinsicReward(RewardTransform):
         return self._reset(tensordict, tensordict_reset)
 
     def transform_reward_spec(self, reward_spec: Composite) -> Composite:
-        """A learned reward has the environment's shape and dtype, but no bounds."""
+        """The learned reward has the environment's shape and dtype, but no bounds."""
         super().transform_reward_spec(reward_spec)
         reward_spec[self.reward_key] = self._unbounded(reward_spec)
         return reward_spec
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Announces the true reward under its new key, where every transform is in its place."""
+        """Adds the true reward's new key, and checks the order of the transforms."""
         there = set(observation_spec.keys(True, True))
         if self.extrinsic_key is not None:
             rewards = self.parent.full_reward_spec
@@ -182,7 +191,7 @@ class IntrinsicReward(RewardTransform):
                 )
             observation_spec[self.extrinsic_key] = self._unbounded(rewards)
         if self.container is not None:
-            check_order(self.container, self, self.module.in_keys, there)
+            _check_order(self.container, self, self.module.in_keys, there)
         return observation_spec
 
     def _unbounded(self, reward_spec: Composite) -> TensorSpec:
@@ -205,6 +214,67 @@ def _result_key(module: nn.Module) -> NestedKey:
     return out_keys[0]
 
 
+def _check_order(
+    env: TransformedEnv, reward: Transform, in_keys: Collection[NestedKey], there: set[NestedKey]
+) -> None:
+    """Refuses an order in which a reward would see s and s' changed by different transforms.
+
+    s' has passed the transforms before the reward. s comes from the last step and has passed all
+    transforms, except those that TorchRL inverts on the way to the environment. A warning says
+    where the reward sees observations normalised on the fly, because a demonstration's often are
+    not.
+    """
+    chain = list(_flat(env.transform))
+    place = next((i for i, part in enumerate(chain) if part is reward), None)
+    if place is None:
+        return
+    read = [unravel_key(key) for key in in_keys]
+    for key in there.intersection(read):
+        changing = [part for part in chain if _changes(part, key)]
+        before = [part for part in chain[:place] if part in changing]
+        s = [part for part in changing if key not in part.in_keys_inv]
+        if s != before:
+            odd = next(part for part in changing if (part in s) != (part in before))
+            name = type(odd).__name__
+            if odd in s:
+                raise UserError(
+                    f"{name} changes {key!r} after the reward, which would see a changed s and an "
+                    f"unchanged s': put {name} before the reward, or let it write another key "
+                    "(out_keys)."
+                )
+            raise UserError(
+                f"{name} changes {key!r} before the reward and is inverted on the way to the "
+                "environment (in_keys_inv), so that the reward would see an unchanged s and a "
+                f"changed s': put {name} after the reward, or let it write another key (out_keys)."
+            )
+        for part in before:
+            if not isinstance(part, NORMALISERS) or key not in part.in_keys:
+                continue
+            name = type(part).__name__
+            warnings.warn(
+                f"the reward stands after {name} and sees normalised {key!r}: fit it on "
+                f"transitions of this environment, or, for a raw demonstration, let {name} write "
+                "another key (out_keys) for the policy.",
+                UserWarning,
+                stacklevel=2,
+            )
+
+
+def _flat(transform: Transform) -> Iterator[Transform]:
+    if isinstance(transform, Compose):
+        for part in transform:
+            yield from _flat(part)
+    else:
+        yield transform
+
+
+def _changes(part: Transform, key: NestedKey) -> bool:
+    # These two list observations in their out_keys but do not change them.
+    if isinstance(part, NextObservationDelta | VideoRecorder):
+        return False
+    return key in part.out_keys
+
+
 def device_of(module: nn.Module) -> torch.device | None:
     """Where a module's parameters are, or its buffers; None if it has neither.
 
@@ -218,7 +288,7 @@ def device_of(module: nn.Module) -> torch.device | None:
 
 @contextmanager
 def eval_mode(module: nn.Module) -> Iterator[None]:
-    """Puts a module in eval mode and every part of it back in the mode it was in.
+    """Puts a module in eval mode, and each part back in its own mode afterwards.
 
     Examples:
         >>> with eval_mode(layer := nn.Dropout()):

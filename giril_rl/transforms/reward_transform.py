@@ -1,4 +1,4 @@
-"""What the transforms of a reward have in common: they copy a batch and read its reward."""
+"""The base of all transforms of one reward, and how they read a batch without changing it."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from giril_rl.errors import UserError
 
 
 class RewardTransform(Transform):
-    """Reads the reward under one key, and says in one sentence what is wrong with it.
+    """Reads the reward under one key and checks it.
 
     Args:
         reward_key: the reward, without the ``"next"``.
-        out_keys: what is written beside the reward.
+        out_keys: further keys that are written.
 
     Examples:
         >>> RewardTransform("prize").in_keys
@@ -32,7 +32,7 @@ class RewardTransform(Transform):
         self._event: torch.Size | None = None
 
     def transform_reward_spec(self, reward_spec: Composite) -> Composite:
-        """Notes the shape of one reward, which each step is held to."""
+        """Remembers the shape of one reward, against which each step is checked."""
         self._event = self._own(reward_spec).shape[len(reward_spec.shape) :]
         return reward_spec
 
@@ -44,8 +44,8 @@ class RewardTransform(Transform):
             )
         return reward_spec[self.reward_key]
 
-    def _read(self, following: TensorDictBase) -> Tensor:
-        reward = find_reward(following, self.reward_key)
+    def _read(self, next_td: TensorDictBase) -> Tensor:
+        reward = find_reward(next_td, self.reward_key)
         if reward is None:
             raise UserError(
                 f"there is no reward under ('next', {self.reward_key!r}): name its reward_key, or "
@@ -53,20 +53,20 @@ class RewardTransform(Transform):
             )
         return reward
 
-    def _read_step(self, following: TensorDictBase) -> Tensor:
-        reward = self._read(following)
-        if self._event is not None and reward.shape[following.ndim :] != self._event:
+    def _read_step(self, next_td: TensorDictBase) -> Tensor:
+        reward = self._read(next_td)
+        if self._event is not None and reward.shape[next_td.ndim :] != self._event:
             raise UserError(
                 f"the environment's reward {self.reward_key!r} has shape {tuple(reward.shape)} "
-                f"where its spec says {(*following.batch_size, *self._event)}: mend one of them."
+                f"where its spec says {(*next_td.batch_size, *self._event)}: mend one of them."
             )
         return reward
 
 
 def copied(tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
-    """A shallow copy of a batch, and its ``"next"``: what is set in them changes no stored data.
+    """A shallow copy of a batch and its ``"next"``, in which entries can be set safely.
 
-    A replay buffer hands out its storage itself where all of it is asked for.
+    A replay buffer returns its storage itself where all of it is requested.
 
     Raises:
         UserError: if there is no ``"next"``.
@@ -74,37 +74,34 @@ def copied(tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
     Examples:
         >>> from tensordict import TensorDict
         >>> batch = TensorDict({"next": {"reward": torch.zeros(2, 1)}}, [2])
-        >>> _, following = copied(batch)
-        >>> _ = following.set("reward", torch.ones(2, 1))
+        >>> _, next_td = copied(batch)
+        >>> _ = next_td.set("reward", torch.ones(2, 1))
         >>> batch["next", "reward"].sum()
         tensor(0.)
     """
     batch = tensordict.copy()
-    following = batch.get("next", None)
-    if following is None:
+    next_td = batch.get("next", None)
+    if next_td is None:
         raise UserError("the batch has no ('next', ...) entries: give whole transitions.")
-    return batch, following
+    return batch, next_td
 
 
-def find_reward(following: TensorDictBase, key: NestedKey) -> Tensor | None:
-    """The reward under a key, None if there is none or it is no tensor (such as None).
+def find_reward(next_td: TensorDictBase, key: NestedKey) -> Tensor | None:
+    """The reward under a key; None if it is missing or not a tensor.
 
     Examples:
         >>> from tensordict import TensorDict
         >>> find_reward(TensorDict({"reward": None}, [2]), "reward")
     """
-    reward = following.get(key, None)
+    reward = next_td.get(key, None)
     return reward if isinstance(reward, Tensor) else None
 
 
 def split_mask(batch: TensorDictBase) -> Tensor | None:
-    """What TorchRL writes where trajectories lie one below the other: False where padded.
+    """The mask of split trajectories, False where they are padded; None where none were split.
 
-    Collectors with ``split_trajs`` or ``trajs_per_batch``, and
+    Collectors with ``split_trajs`` or ``trajs_per_batch`` write it, and
     :func:`torchrl.collectors.utils.split_trajectories`.
-
-    Returns:
-        The mask, or None for a batch whose trajectories were not split.
 
     Examples:
         >>> from tensordict import TensorDict

@@ -1,4 +1,4 @@
-"""Rewards divided by the running deviation of their discounted return."""
+"""Divides rewards by the running standard deviation of their discounted return."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from torchrl.data import Bounded, Composite, Unbounded
 
 from giril_rl.errors import UserError
 from giril_rl.transforms.reward_transform import RewardTransform, copied, split_mask
-from giril_rl.transforms.running import discounted_filter, running_moments
 
 ResetRule = Literal["never", "done"]
 
 # OpenAI baselines' RunningMeanStd starts as if it had seen this many values, of variance 1.
 INITIAL_COUNT = 1e-4
+BLOCK = 128
 
 
 class NonFiniteReward(UserError):
-    """A reward that is NaN, infinite or too large, from which no running deviation can be learned.
+    """A reward that is NaN, infinite or too large to be squared.
 
     Args:
-        what: names the reward and its place.
+        what: the reward and where it occurred.
 
     Examples:
         >>> raise NonFiniteReward("the reward is nan in environment 0 at step 5 of the batch")
@@ -43,50 +43,50 @@ class NonFiniteReward(UserError):
 class ReturnScaling(RewardTransform):
     """Divides the reward by the running standard deviation of ``R_t = gamma * R_{t-1} + r_t``.
 
-    No mean is subtracted, so that a reward keeps its sign. The filter runs over time, for each
-    environment, and goes on from one batch to the next. The reward of step t is divided by the
-    deviation of all filtered returns up to and including those of step t in all environments:
-    step by step or a whole batch at once, the numbers are the same.
+    No mean is subtracted, so that a reward keeps its sign. The filter runs over time in each
+    environment and continues from batch to batch. The reward of step t is divided by the standard
+    deviation of all filtered returns up to and including step t, in all environments. A batch gets
+    the same numbers as its steps one by one.
 
     Sources: Burda et al. 2018, "Large-Scale Study of Curiosity-Driven Learning" (arXiv
-    1808.04355) and the same authors' RND, whose RewardForwardFilter never resets; with
-    ``reset="done"`` as OpenAI baselines' VecNormalize and Gymnasium's NormalizeReward, which
-    forget the return at an episode's end. As in baselines, the moments start as if 1e-4 values of
+    1808.04355), and the same authors' RND, whose RewardForwardFilter never resets. With
+    ``reset="done"`` as in OpenAI baselines' VecNormalize and Gymnasium's NormalizeReward, which
+    reset the return at an episode's end. As in baselines, the moments start as if 1e-4 values of
     mean 0 and variance 1 had been seen, and the scaled reward is clipped.
 
-    In an environment all batch dimensions are environments. In a batch, ``time_dim`` is time and
-    the others are environments; a flat batch is one environment's time. Inside a worker of a
-    batched environment it would see one environment only, and refuses. Nor does it learn from split
-    trajectories, which are padded and not side by side in time. A batch is not changed: a shallow
-    copy of it is returned.
+    In an environment, all batch dimensions are environments. In a batch, ``time_dim`` is time and
+    the other dimensions are environments; a flat batch is the time of one environment. The batch
+    does not change: a shallow copy is returned. The transform refuses to run inside a worker, which
+    sees one environment only, and to learn from split trajectories, whose steps are padded and not
+    simultaneous.
 
-    After :meth:`freeze` nothing is learned: rewards of any batch shape, also shuffled, are divided
-    by the present deviation. For batches, eval mode does the same. In an environment it does not,
-    because TorchRL puts every attached transform in eval mode.
+    After :meth:`freeze`, rewards of any batch shape, shuffled or not, are divided by the present
+    standard deviation. Eval mode does the same for batches, but not in an environment, because
+    TorchRL puts every attached transform in eval mode.
 
     Args:
         gamma: discount of the filter, in [0, 1].
         reward_key: the reward, without the ``"next"``.
-        reset: ``"never"``, or ``"done"``: at the end of an episode, and at a manual reset of the
-            environment.
+        reset: when the filter starts again: ``"never"``, or ``"done"`` for an episode's end and a
+            manual reset of the environment.
         clip: scaled rewards are clipped to plus or minus this; None does not clip.
         eps: added to the variance.
         time_dim: which of the batch dimensions is time.
-        done_key: the end of an episode, without the ``"next"``; read for ``reset="done"`` only.
+        done_key: the end of an episode, without the ``"next"``; only ``reset="done"`` reads it.
 
     Raises:
-        UserError: for a gamma, reset rule, clip or eps that makes no sense, a batch with another
-            number of environments than before, or when frozen before anything was learned.
-        NonFiniteReward: for a reward that is NaN, infinite or too large to be squared, naming its
-            environment and step; nothing is learned from its batch. A compiled graph cannot
-            raise: it learns nothing and gives NaN.
+        UserError: for an invalid gamma, reset rule, clip or eps, for another number of environments
+            than before, or if frozen before anything was learned.
+        NonFiniteReward: for a reward that is NaN, infinite or too large to be squared, with its
+            environment and step. Nothing is learned from its batch. A compiled graph cannot raise:
+            it learns nothing and gives NaN.
 
     Examples:
         >>> from tensordict import TensorDict
         >>> scaling = ReturnScaling(gamma=0.0)
         >>> reward = torch.tensor([[[1.0]], [[-1.0]], [[3.0]], [[-3.0]]])  # 4 environments, 1 step
         >>> batch = scaling(TensorDict({"next": {"reward": reward}}, [4, 1]))
-        >>> batch["next", "reward"].flatten()  # their deviation is nearly the root of 5
+        >>> batch["next", "reward"].flatten()  # divided by nearly the root of 5
         tensor([ 0.4472, -0.4472,  1.3417, -1.3417])
     """
 
@@ -130,8 +130,8 @@ class ReturnScaling(RewardTransform):
 
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Scales a batch step after step along ``time_dim`` and returns it, as a shallow copy."""
-        batch, following = copied(tensordict)
+        """Scales a batch step by step along ``time_dim``; returns a shallow copy."""
+        batch, next_td = copied(tensordict)
         time_dim = self.time_dim % batch.ndim if batch.ndim else None
         learn = self.training and not self.frozen
         if learn and split_mask(batch) is not None:
@@ -139,7 +139,7 @@ class ReturnScaling(RewardTransform):
                 "the batch holds split trajectories, padded and not side by side in time: collect "
                 "with split_trajs=False, or call .freeze() to scale without learning."
             )
-        self._scale(following, self._read(following), time_dim, learn)
+        self._scale(next_td, self._read(next_td), time_dim, learn)
         return batch
 
     @torch.no_grad()
@@ -148,28 +148,28 @@ class ReturnScaling(RewardTransform):
         return self._scale(next_tensordict, reward, None, not self.frozen)
 
     def freeze(self) -> ReturnScaling:
-        """Stops learning; rewards are divided by the present deviation."""
+        """Stops learning. Rewards are divided by the present standard deviation."""
         self.frozen = True
         return self
 
     def unfreeze(self) -> ReturnScaling:
-        """Goes on learning."""
+        """Resumes learning."""
         self.frozen = False
         return self
 
     def _scale(
-        self, following: TensorDictBase, reward: Tensor, time_dim: int | None, learn: bool
+        self, next_td: TensorDictBase, reward: Tensor, time_dim: int | None, learn: bool
     ) -> TensorDictBase:
         steps = _as_steps(reward, time_dim, self.mean)
         if learn:
             done = None
             if self.reset_rule == "done":
-                flag = following.get(self.done_key)
+                flag = next_td.get(self.done_key)
                 while flag.ndim < reward.ndim:
                     flag = flag.unsqueeze(-1)
                 done = _as_steps(flag.expand_as(reward), time_dim, self.mean).bool()
-            values = reward.shape[following.ndim :].numel()
-            deviation = self._learn(steps, done, values)
+            values = reward.shape[next_td.ndim :].numel()
+            std = self._learn(steps, done, values)
         elif self.running_return.numel() == 0:
             raise UserError(
                 "ReturnScaling has learned nothing yet and is in eval mode (TorchRL's "
@@ -177,11 +177,11 @@ class ReturnScaling(RewardTransform):
                 ".unfreeze(), or load its state."
             )
         else:
-            deviation = (self.m2 / self.count + self.eps).sqrt()
-        scaled = steps / deviation
+            std = (self.m2 / self.count + self.eps).sqrt()
+        scaled = steps / std
         if self.clip is not None:
             scaled = scaled.clamp(-self.clip, self.clip)
-        return following.set(self.reward_key, _from_steps(scaled, reward, time_dim))
+        return next_td.set(self.reward_key, _from_steps(scaled, reward, time_dim))
 
     def _learn(self, steps: Tensor, done: Tensor | None, values: int) -> Tensor:
         envs, before = steps.shape[0], self.running_return
@@ -203,7 +203,7 @@ class ReturnScaling(RewardTransform):
                 new = [torch.where(learn, x, y) for x, y in zip(new, old, strict=True)]
             elif not _finite(m2[-1]):
                 raise NonFiniteReward(_place(steps, values))
-            # Replaced, not filled: torch.compile (2.13) loses what these buffers are filled with.
+            # Replaced, not filled in place, which torch.compile (2.13) would lose.
             self.running_return, self.count, self.mean, self.m2 = (x.clone() for x in new)
         elif first:
             self.running_return = before
@@ -231,7 +231,7 @@ class ReturnScaling(RewardTransform):
         return self._reset(tensordict, tensordict_reset)
 
     def transform_reward_spec(self, reward_spec: Composite) -> Composite:
-        """The scaled reward's bounds are the clipping's."""
+        """The scaled reward is bounded by ``clip``."""
         super().transform_reward_spec(reward_spec)
         spec = reward_spec[self.reward_key]
         kind: dict[str, Any] = {"shape": spec.shape, "dtype": spec.dtype, "device": spec.device}
@@ -257,7 +257,7 @@ class ReturnScaling(RewardTransform):
 
 
 def _as_steps(value: Tensor, time_dim: int | None, like: Tensor) -> Tensor:
-    """Environments (and whatever else a reward has dimensions for) by time, ``(M, T)``."""
+    """A reward as ``(M, T)``: environments and event dimensions by time."""
     value = value.to(like)
     if time_dim is None:
         return value.reshape(-1, 1)
@@ -273,12 +273,12 @@ def _from_steps(steps: Tensor, like: Tensor, time_dim: int | None) -> Tensor:
 
 
 def _finite(value: Tensor) -> bool:
-    """The only look at a value, once a batch."""
+    """Waits for the device, once a batch."""
     return bool(value.isfinite())
 
 
 def _place(steps: Tensor, values: int) -> str:
-    """The first reward, in time, that is not finite; an environment has so many values."""
+    """Describes the earliest reward that is not finite; an environment has ``values`` of them."""
     bad = ~steps.isfinite()
     if not bad.any():
         return f"a reward of {steps.abs().max().item():g} is too large to be squared"
@@ -293,3 +293,88 @@ def _place(steps: Tensor, values: int) -> str:
 
 def _reset_key(done_key: NestedKey) -> NestedKey:
     return "_reset" if isinstance(done_key, str) else (*done_key[:-1], "_reset")
+
+
+def discounted_filter(
+    reward: Tensor, done: Tensor | None, carry: Tensor, gamma: float
+) -> tuple[Tensor, Tensor]:
+    """``R_t = gamma * R_{t-1} + r_t``, where ``R_{t-1}`` counts as 0 after an episode's end.
+
+    Args:
+        reward: ``(M, T)``, M environments over T steps.
+        done: ``(M, T)`` bool, whether the episode ended with this step; None never resets.
+        carry: ``(M,)``, the filter's value before the first step.
+        gamma: discount, in [0, 1].
+
+    Returns:
+        R ``(M, T)``, and the carry ``(M,)`` for the next batch, 0 where the last step was done.
+
+    Examples:
+        >>> discounted_filter(torch.tensor([[1.0, 1.0, 1.0]]), None, torch.tensor([4.0]), 0.5)
+        (tensor([[3.0000, 2.5000, 2.2500]]), tensor([2.2500]))
+    """
+    steps = reward.shape[1]
+    if steps == 0:
+        return reward, carry
+    size = min(BLOCK, steps)
+    index = torch.arange(size + 1, device=reward.device)
+    powers = torch.full((), gamma, dtype=reward.dtype, device=reward.device) ** index
+    # weights[j, i] = gamma^(i - j), the weight of the reward of step j at step i of its block.
+    weights = powers[(index[:-1] - index[:-1, None]).clamp_min(0)].triu()
+    blocks = []
+    for block in reward.split(size, dim=1):
+        length = block.shape[1]
+        values = block @ weights[:length, :length] + carry[:, None] * powers[1 : length + 1]
+        blocks.append(values)
+        carry = values[:, -1]
+    filtered = torch.cat(blocks, 1)
+    if done is None:
+        return filtered, carry
+    return _forget(filtered, done, gamma)
+
+
+def _forget(filtered: Tensor, done: Tensor, gamma: float) -> tuple[Tensor, Tensor]:
+    """Subtracts what came before an episode's start: ``R_t - gamma^(t - k) * R_k``."""
+    time = torch.arange(filtered.shape[1], device=filtered.device)
+    ends = torch.where(done, time, -1).cummax(1).values
+    last_end = torch.cat((torch.full_like(ends[:, :1], -1), ends[:, :-1]), 1)
+    base = torch.full((), gamma, dtype=filtered.dtype, device=filtered.device)
+    old = base ** (time - last_end) * filtered.gather(1, last_end.clamp_min(0))
+    forgetful = filtered - torch.where(last_end >= 0, old, 0.0)
+    return forgetful, torch.where(done[:, -1], 0.0, forgetful[:, -1])
+
+
+def running_moments(
+    values: Tensor, count: Tensor, mean: Tensor, m2: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Count, mean and sum of squared deviations after each step, all environments pooled.
+
+    Each step's sample is merged as in Chan, Golub and LeVeque (1979), but without a loop.
+
+    Args:
+        values: ``(M, T)``.
+        count: number of values seen before, a scalar (like mean and m2).
+        mean: their mean.
+        m2: the sum of their squared deviations from the mean; the variance is ``m2 / count``.
+
+    Returns:
+        Three tensors of shape ``(T,)``: count, mean and m2 after each step.
+
+    Examples:
+        >>> zero = torch.tensor(0.0)
+        >>> running_moments(torch.tensor([[1.0, 3.0]]), zero, zero, zero)
+        (tensor([1., 2.]), tensor([1., 2.]), tensor([0., 2.]))
+    """
+    envs, steps = values.shape
+    if steps == 0:
+        return count.expand(0), mean.expand(0), m2.expand(0)
+    step_mean = values.mean(0)
+    within = (values - step_mean).square().sum(0)
+    total = count + envs * torch.arange(1, steps + 1, device=values.device, dtype=values.dtype)
+    # Sums relative to the first step's mean keep their digits when the level is high.
+    shift = step_mean[0]
+    sums = (step_mean - shift).cumsum(0) * envs
+    new_mean = shift + ((mean - shift) * count + sums) / total
+    old_mean = torch.cat((mean.reshape(1), new_mean[:-1]))
+    between = (step_mean - old_mean).square() * ((total - envs) * envs / total)
+    return total, new_mean, m2 + (within + between).cumsum(0)

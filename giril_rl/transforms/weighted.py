@@ -1,4 +1,4 @@
-"""Several rewards as one: their weighted sum."""
+"""The weighted sum of several rewards."""
 
 from __future__ import annotations
 
@@ -17,28 +17,27 @@ from giril_rl.transforms.reward_transform import copied, find_reward
 
 
 class WeightedReward(Transform):
-    """Replaces the reward by a weighted sum of rewards that lie under several keys.
+    """Replaces the reward by a weighted sum of rewards under several keys.
 
     Put it after :class:`~giril_rl.transforms.IntrinsicReward`, which leaves the learned reward
     under ``"reward"`` and the true one under ``"extrinsic_reward"``: then
-    ``WeightedReward({"reward": 0.8, "extrinsic_reward": 0.2})`` is 0.8 times the learned one plus
-    0.2 times the true one. The terms themselves stay where they are, except that the sum takes the
-    place of the term under ``reward_key``. A term of weight 0 is not read, so that not even a NaN
-    of its gets through.
+    ``WeightedReward({"reward": 0.8, "extrinsic_reward": 0.2})`` is 0.8 times the learned reward
+    plus 0.2 times the true one. The sum replaces the term under ``reward_key``; other terms stay.
+    A term with weight 0 is not read, so that it may be NaN or missing.
 
-    The same numbers come out in an environment (also inside a worker), on a batch and in a replay
-    buffer. In an environment a term may be a reward or an observation; other rewards that it reads
-    become observations (zero at reset), because a second reward key would break code that expects
-    one. They must then not be among a policy's ``in_keys``. ``weights`` may be changed later.
+    It gives the same numbers in an environment (also inside a worker), on a batch and in a replay
+    buffer. In an environment a term may be a reward or an observation. Further rewards that it
+    reads become observations (zero at reset), because code that expects one reward key fails with
+    two; keep them out of a policy's ``in_keys``. ``weights`` may be changed later.
 
     Args:
-        weights: from each term's key, without the ``"next"``, to its weight. All terms have the
+        weights: maps each term's key, without the ``"next"``, to its weight. All terms have the
             same shape.
         reward_key: where the sum is written, without the ``"next"``.
 
     Raises:
-        UserError: for no weights, one that is not a finite number, or terms that are missing or of
-            different shapes.
+        UserError: if there are no weights or one is not finite, or if terms are missing or differ
+            in shape.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -62,21 +61,21 @@ class WeightedReward(Transform):
         super().__init__(in_keys=list(self.weights), out_keys=[self.reward_key])
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Writes the sum of a batch of any shape and returns the batch, as a shallow copy."""
-        batch, following = copied(tensordict)
-        self._sum(following)
+        """Writes the sum for a batch of any shape; returns a shallow copy."""
+        batch, next_td = copied(tensordict)
+        self._sum(next_td)
         return batch
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         return self._sum(next_tensordict)
 
-    def _sum(self, following: TensorDictBase) -> TensorDictBase:
+    def _sum(self, next_td: TensorDictBase) -> TensorDictBase:
         total: Tensor | None = None
-        like = find_reward(following, self.reward_key)
+        like = find_reward(next_td, self.reward_key)
         for key, weight in self.weights.items():
             if weight == 0:
                 continue
-            term = find_reward(following, key)
+            term = find_reward(next_td, key)
             if term is None:
                 raise UserError(f"there is no reward under ('next', {key!r}): name another key.")
             like = term if like is None else like
@@ -91,7 +90,7 @@ class WeightedReward(Transform):
             if like is None:
                 raise UserError("all weights are 0 and there is no reward: give a weight.")
             total = torch.zeros_like(like)
-        return following.set(self.reward_key, total)
+        return next_td.set(self.reward_key, total)
 
     def _reset(
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
@@ -107,7 +106,7 @@ class WeightedReward(Transform):
         return self._reset(tensordict, tensordict_reset)
 
     def transform_reward_spec(self, reward_spec: Composite) -> Composite:
-        """The sum has no bounds; the other rewards that it reads are rewards no longer."""
+        """The sum has no bounds; further rewards that it reads are removed."""
         observations = self.parent.full_observation_spec
         keys = {*reward_spec.keys(True, True), *observations.keys(True, True)}
         missing = [key for key in self.weights if key not in keys]
@@ -125,7 +124,7 @@ class WeightedReward(Transform):
         return reward_spec
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Announces the other rewards that it reads as observations."""
+        """Adds the further rewards that it reads."""
         rewards = self.parent.full_reward_spec
         for key in self._moved(rewards):
             observation_spec[key] = _unbounded(rewards[key])

@@ -30,7 +30,7 @@ from pathlib import Path
 import ale_py
 import gymnasium
 import torch
-from stable_baselines3 import PPO
+from stable_baselines3 import PPO as StablePPO
 from stable_baselines3.common.env_util import make_atari_env
 from stable_baselines3.common.vec_env import VecFrameStack
 from torchrl.envs import Compose
@@ -39,8 +39,8 @@ from giril_rl.config.schema import RunConfig, TaskConfig
 from giril_rl.config.task_defaults import apply_task_defaults
 from giril_rl.envs import make_env
 from giril_rl.rewards import GenerativeReward
-from giril_rl.runs.allocator import keep_freed_memory
-from giril_rl.training import Run, make_agent, train_ppo
+from giril_rl.runs.machine import keep_freed_memory
+from giril_rl.training import PPO, Run, make_agent, train_policy
 from giril_rl.transforms import BatchMeanReward, IntrinsicReward, ReturnScaling
 
 
@@ -58,7 +58,7 @@ def ours(config: RunConfig, device: str) -> Callable[[int], None]:
             tempfile.TemporaryDirectory() as folder,
             Run.open(Path(folder) / "run", {}, recipe="benchmark") as run,
         ):
-            train_ppo(env, agent, relabel, config.ppo, steps=steps, seed=0, run=run)
+            train_policy(env, PPO(agent, config.ppo, steps=steps), relabel, seed=0, run=run)
 
     return train
 
@@ -68,7 +68,7 @@ def theirs(config: RunConfig, device: str) -> Callable[[int], None]:
     gymnasium.register_envs(ale_py)
     cfg = config.ppo
     game = config.task.env_id.removeprefix("ALE/").removesuffix("-v5")
-    model = PPO(
+    model = StablePPO(
         "CnnPolicy",
         VecFrameStack(make_atari_env(f"{game}NoFrameskip-v4", cfg.num_envs, seed=0), 4),
         n_steps=cfg.rollout,

@@ -13,7 +13,7 @@ import warnings
 import torch
 from frame_losses import CASES
 
-from giril_rl.graphs.traced import TracedGradients
+from giril_rl.graphs import TracedGradients
 
 SIZES = {"ppo": 256, "giril": 32, "cdil": 32, "gail": 128, "vail": 128}
 """Transitions in a step as the recipes have them."""

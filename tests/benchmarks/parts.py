@@ -22,11 +22,10 @@ from torchrl.objectives import ClipPPOLoss
 
 from giril_rl.config.schema import TaskConfig
 from giril_rl.envs import gym_factory, make_env
-from giril_rl.graphs.traced import TracedGradients
+from giril_rl.graphs import TracedGradients
 from giril_rl.networks.distributions import DiagonalGaussian
-from giril_rl.policies.policy import NORMALISED, ActorCritic
-from giril_rl.policies.recorded_acting import RecordedActing
-from giril_rl.training.ppo import LEARNER_KEYS
+from giril_rl.policies import NORMALISED, ActorCritic, RecordedActing
+from giril_rl.training.ppo import LOSS_KEYS
 
 TASK = TaskConfig(name="inverted_pendulum", env_id="InvertedPendulumBulletEnv-v0")
 
@@ -90,7 +89,7 @@ def gradients(compiled: bool) -> dict[str, Callable[[], object]]:
         functional=False,
         log_explained_variance=False,
     )
-    keys = (NORMALISED, agent.drawn_key, *LEARNER_KEYS)
+    keys = (NORMALISED, agent.drawn_key, *LOSS_KEYS)
     shapes = {key: (250, 1) for key in keys} | {"action_log_prob": (250,), NORMALISED: (250, 5)}
     batch = TensorDict({key: torch.randn(shape) for key, shape in shapes.items()}, [250])
     traced = TracedGradients(loss, keys=keys)

@@ -12,8 +12,6 @@ import time
 from collections.abc import Callable
 
 import torch
-from giril_rl.rewards.chunks import PIXELS_AT_ONCE
-from giril_rl.rewards.equations import reconstruction_error
 from tensordict import TensorDict
 from torch import Tensor, nn
 from torchrl.data import Categorical
@@ -21,6 +19,8 @@ from torchrl.data import Categorical
 from giril_rl.networks.pixel_decoder import PixelDecoder
 from giril_rl.rewards import GenerativeReward
 from giril_rl.rewards.factored import factored_error
+from giril_rl.rewards.generative import reconstruction_error
+from giril_rl.rewards.transitions import PIXELS_AT_ONCE
 
 
 def plain(decoder: PixelDecoder) -> PixelDecoder:

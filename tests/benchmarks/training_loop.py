@@ -20,14 +20,14 @@ from pathlib import Path
 
 import gymnasium
 import torch
-from stable_baselines3 import PPO
+from stable_baselines3 import PPO as StablePPO
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 from torchrl.envs import Compose
 
 from giril_rl.config.schema import PPOConfig, TaskConfig
 from giril_rl.envs import gym_factory, make_env
 from giril_rl.rewards import GenerativeReward
-from giril_rl.training import Run, make_agent, train_ppo
+from giril_rl.training import PPO, Run, make_agent, train_policy
 from giril_rl.transforms import BatchMeanReward, IntrinsicReward, ReturnScaling
 
 ENV_IDS = {
@@ -52,7 +52,7 @@ def ours(task: TaskConfig, cfg: PPOConfig) -> Callable[[int], None]:
             tempfile.TemporaryDirectory() as folder,
             Run.open(Path(folder) / "run", {}, recipe="benchmark") as run,
         ):
-            train_ppo(env, agent, relabel, cfg, steps=steps, seed=0, run=run)
+            train_policy(env, PPO(agent, cfg, steps=steps), relabel, seed=0, run=run)
 
     return train
 
@@ -60,7 +60,7 @@ def ours(task: TaskConfig, cfg: PPOConfig) -> Callable[[int], None]:
 def theirs(task: TaskConfig, cfg: PPOConfig) -> Callable[[int], None]:
     """stable-baselines3's PPO behind its VecNormalize."""
     make: Callable[[], gymnasium.Env] = gym_factory(task)
-    model = PPO(
+    model = StablePPO(
         "MlpPolicy",
         VecNormalize(DummyVecEnv([make] * cfg.num_envs), gamma=cfg.gamma),
         n_steps=cfg.rollout,

@@ -17,8 +17,7 @@ from torchrl.data import Bounded, Categorical
 
 from giril_rl.cli.command_line import main
 from giril_rl.demos import Demonstration, record_demonstration
-from giril_rl.policies.pixel_policy import PixelActorCritic
-from giril_rl.policies.policy import ActorCritic
+from giril_rl.policies import ActorCritic, PixelActorCritic
 from giril_rl.rewards import GenerativeReward
 
 WORDS = [

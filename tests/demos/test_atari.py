@@ -12,7 +12,7 @@ from giril_rl.demos import Demonstration, record_demonstration, to_minari, verif
 from giril_rl.demos.record import episode_seed
 from giril_rl.demos.show import describe
 from giril_rl.envs import gym_factory
-from giril_rl.envs.atari_game import AtariGame
+from giril_rl.envs.atari_preprocessing import AtariGame
 
 pytest.importorskip("ale_py")
 

@@ -8,20 +8,11 @@ import shutil
 import pytest
 import torch
 from tensordict import TensorDict
+from wrong import Evil
 
 from giril_rl.demos import Demonstration, verify_by_replay
 from giril_rl.errors import UserError
 from giril_rl.files.disk import write_json
-
-
-class Bomb:
-    """Leaves a folder behind if it is ever unpickled."""
-
-    def __init__(self, path):
-        self.path = path
-
-    def __reduce__(self):
-        return (os.mkdir, (str(self.path),))
 
 
 @pytest.fixture
@@ -105,7 +96,7 @@ def test_unsound_demonstration_is_not_saved(demo, tmp_path):
 def test_pickle_is_never_loaded(demo, tmp_path):
     mark = tmp_path / "exploded"
     data = demo.transitions.clone()
-    data.set_non_tensor("note", Bomb(mark))
+    data.set_non_tensor("note", Evil(mark))
     data.memmap(tmp_path / "evil" / "transitions")
     write_json(tmp_path / "evil" / "card.json", {"format_version": 1, **demo.card})
     (sidecar,) = (tmp_path / "evil").rglob("*.pickle")
@@ -119,7 +110,7 @@ def test_pickle_is_never_loaded(demo, tmp_path):
 def test_disguised_pickle_is_never_loaded(folder, tmp_path):
     mark = tmp_path / "exploded"
     stray = folder / "transitions" / "next" / "other.pickle"
-    stray.write_bytes(pickle.dumps(Bomb(mark)))
+    stray.write_bytes(pickle.dumps(Evil(mark)))
     with pytest.raises(UserError, match=r"'other\.pickle', which is not a tensor"):
         Demonstration.load(folder)
     meta = folder / "transitions" / "next" / "meta.json"

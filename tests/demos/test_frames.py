@@ -1,4 +1,3 @@
-import os
 import pickle
 import zipfile
 
@@ -6,21 +5,12 @@ import numpy as np
 import pytest
 import torch
 from pixels import Pixels, steer
+from wrong import Evil
 
 from giril_rl.demos import Demonstration, record_demonstration, verify_by_replay
-from giril_rl.demos.frames import load_frames, save_frames
+from giril_rl.demos.storage import load_frames, save_frames
 from giril_rl.errors import UserError
 from giril_rl.files.disk import read_json, write_json
-
-
-class Bomb:
-    """Leaves a folder behind if it is ever unpickled."""
-
-    def __init__(self, path):
-        self.path = path
-
-    def __reduce__(self):
-        return (os.mkdir, (str(self.path),))
 
 
 @pytest.fixture
@@ -135,11 +125,11 @@ def test_a_card_must_declare_the_frames(folder, declared):
 
 def test_pickle_in_the_archive_is_never_loaded(folder, tmp_path):
     mark = tmp_path / "exploded"
-    planes = np.array([Bomb(mark)], dtype=object)
+    planes = np.array([Evil(mark)], dtype=object)
     np.savez_compressed(folder / "frames.npz", **{**parts(folder), "planes": planes})
     with pytest.raises(UserError, match=r"has planes of object \[1\]"):
         Demonstration.load(folder)
-    (folder / "frames.npz").write_bytes(pickle.dumps(Bomb(mark)))
+    (folder / "frames.npz").write_bytes(pickle.dumps(Evil(mark)))
     with pytest.raises(UserError, match=r"frames\.npz is damaged"):
         Demonstration.load(folder)
     assert not mark.exists()

@@ -1,23 +1,18 @@
 """Data sets in and out: the same bits, and a card that says what is known."""
 
 import json
-import sys
 from dataclasses import replace
 from pathlib import Path
 
+import datasets
 import gymnasium
 import numpy as np
 import pytest
 import torch
 
-sys.path.insert(0, str(Path(__file__).parent))
-
-import datasets
-
 from giril_rl.cli.command_line import main
-from giril_rl.demos import Demonstration, record_demonstration, to_npz
+from giril_rl.demos import Demonstration, named_task, record_demonstration, to_npz
 from giril_rl.demos.importing import import_demonstration
-from giril_rl.demos.task import named_task
 from giril_rl.envs import AtariGymEnv
 from giril_rl.errors import UserError
 

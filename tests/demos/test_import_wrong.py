@@ -2,17 +2,13 @@
 
 import json
 import pickle
-import sys
 from pathlib import Path
 
+import datasets
 import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
-
-sys.path.insert(0, str(Path(__file__).parent))
-
-import datasets
 from wrong import (
     STRAY,
     Evil,
@@ -347,9 +343,8 @@ def test_each_fault_is_one_sentence(case, capsys):
     ],
 )
 def test_wrong_words_are_one_sentence(argv, sentence, capsys):
-    from giril_rl.demos import Demonstration
+    from giril_rl.demos import Demonstration, named_task
     from giril_rl.demos.importing import import_demonstration
-    from giril_rl.demos.task import named_task
 
     demo = import_demonstration(columns(), named_task(None, datasets.ENV))
     demo.save("demo")

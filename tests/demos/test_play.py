@@ -6,9 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parent))
-
+from counter import Counter
 from pixels import Pixels
 
 from giril_rl.cli.command_line import main
@@ -80,6 +78,13 @@ def test_a_closed_window_keeps_nothing():
     assert screen.closed == 1
 
 
+def test_a_game_that_does_not_name_its_actions_is_refused():
+    screen = Keys()
+    with pytest.raises(UserError, match=r"Counter does not name its actions .* by hand"):
+        play_demonstration(Counter, screen, episodes=1, seed=0)
+    assert screen.frames == []
+
+
 def refused(capsys, *words):
     assert main(["demo", "play", *words, "--out", "demo"]) == 2
     captured = capsys.readouterr()
@@ -98,7 +103,7 @@ def test_without_pygame_or_a_screen_one_sentence_says_so(tmp_path, monkeypatch, 
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setattr(sys, "platform", "linux")
     assert "there is no display here" in refused(capsys, "--task", "breakout")
-    assert "is no Atari game" in refused(capsys, "--env-id", "CartPole-v1")
+    assert "shows no images" in refused(capsys, "--env-id", "CartPole-v1")
     assert "--episodes 0: at least 1" in refused(capsys, "--task", "breakout", "--episodes", "0")
     assert "--seed -1: at least 0" in refused(capsys, "--task", "breakout", "--seed", "-1")
     assert "either --task NAME or --env-id ID" in refused(capsys)

@@ -43,7 +43,7 @@ def test_progress_is_shown_where_it_is_asked_for(amount, monkeypatch):
 
     (total,) = amount.values()
     assert f"{total}/{total}" in written()
-    monkeypatch.setattr("giril_rl.runs.progress.time.monotonic", itertools.count(0, 60).__next__)
+    monkeypatch.setattr("tqdm.std.time", itertools.count(0, 60).__next__)
     assert written(show_progress=False) == ""
 
 

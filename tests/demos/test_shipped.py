@@ -8,9 +8,9 @@ import pytest
 from giril_rl.cli.command_line import main
 from giril_rl.config.schema import DemoConfig, ExpertConfig, RunConfig, TaskConfig
 from giril_rl.demos import Demonstration, named_task, shipped_demonstrations, verify_by_replay
+from giril_rl.demos.check import check_for_task
 from giril_rl.demos.shipped import demonstration_folder, demonstration_name
-from giril_rl.demos.task import as_recorded_task, check_for_task
-from giril_rl.envs import gym_factory
+from giril_rl.envs import as_recorded_task, gym_factory
 from giril_rl.errors import UserError
 from giril_rl.training import check_inputs, obtain_demonstration
 

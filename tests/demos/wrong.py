@@ -12,10 +12,13 @@ import pytest
 
 
 class Evil:
-    """Leaves a mark where it is unpickled."""
+    """Leaves a file behind where it is unpickled."""
+
+    def __init__(self, mark="mark"):
+        self.mark = str(mark)
 
     def __reduce__(self):
-        return (Path("mark").touch, ())
+        return Path.touch, (Path(self.mark),)
 
 
 def columns(**changes):

@@ -14,7 +14,7 @@ from giril_rl.config.recipe_files import shipped_conf
 from giril_rl.config.schema import TaskConfig
 from giril_rl.envs import AtariEnv, AtariGymEnv, for_scores, gym_factory, make_env
 from giril_rl.envs.atari import Opened
-from giril_rl.envs.atari_game import AtariGame
+from giril_rl.envs.atari_preprocessing import AtariGame
 from giril_rl.errors import UserError
 from giril_rl.runs.randomness import stream_seed
 from giril_rl.training import evaluate

@@ -1,26 +1,22 @@
 from dataclasses import replace
+from functools import partial
 
 import gymnasium
 import numpy as np
 import pytest
+import rollouts
 import torch
+from rollouts import BULLET, random_actions
 from torchrl.collectors import Collector
 from torchrl.envs.utils import check_env_specs
 
 from giril_rl.config.schema import TaskConfig
 from giril_rl.envs import FixedHorizonEnv, GymVectorEnv, make_env, with_own_episodes
 from giril_rl.errors import UserError
-from giril_rl.files.checkpoint import load_state, save_state
 from giril_rl.runs.randomness import stream_seed
 
-KEYS = ["observation", "action"] + [
-    ("next", name)
-    for name in (
-        *("observation", "reward", "done", "terminated", "truncated"),
-        *("following_observation", "scored"),
-    )
-]
-BULLET = "InvertedPendulumBulletEnv-v0"
+KEYS = [*rollouts.KEYS, ("next", "following_observation"), ("next", "scored")]
+play = partial(rollouts.play, keys=KEYS)
 # CartPole warns of the steps that these tests mean to take.
 pytestmark = pytest.mark.filterwarnings("ignore:.*already returned terminated = True")
 
@@ -28,22 +24,6 @@ pytestmark = pytest.mark.filterwarnings("ignore:.*already returned terminated = 
 def task(env_id, limit=None, **kwargs):
     kwargs = {"horizon": "fixed", **kwargs}
     return TaskConfig(name="test", env_id=env_id, max_episode_steps=limit, **kwargs)
-
-
-def random_actions(env, steps, seed=0):
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
-        return torch.stack([env.action_spec.rand() for _ in range(steps)])
-
-
-def play(env, actions, root=None, keys=KEYS):
-    """All transitions ``[N, T]`` and the root that would come next."""
-    root = env.reset() if root is None else root
-    steps = []
-    for action in actions:
-        transition, root = env.step_and_maybe_reset(root.clone().set("action", action))
-        steps.append(transition.select(*keys).clone())
-    return torch.stack(steps, 1), root
 
 
 def counted(step_counter, *, length, limit, steps, after_failure):
@@ -123,7 +103,7 @@ def test_without_a_failure_it_is_the_same_environment():
     own = make_env(task("Pendulum-v1", 9, horizon="own"), 3, seed=2)
     fixed = make_env(task("Pendulum-v1", 9), 3, seed=2)
     actions = random_actions(own, 30)
-    keys = KEYS[:-2]
+    keys = rollouts.KEYS
     expected, _ = play(own, actions, keys=keys)
     batch, _ = play(fixed, actions)
     for key in keys:
@@ -135,7 +115,7 @@ def test_without_a_failure_it_is_the_same_environment():
 def test_up_to_the_first_failure_it_is_the_task_itself():
     own = make_env(task("CartPole-v1", horizon="own"), 4, seed=1)
     actions = random_actions(own, 60)
-    expected, _ = play(own, actions, keys=KEYS[:-2])
+    expected, _ = play(own, actions, keys=rollouts.KEYS)
     for after_failure in ("reset", "continue"):
         fixed = make_env(task("CartPole-v1", 60, after_failure=after_failure), 4, seed=1)
         batch, _ = play(fixed, actions)
@@ -177,25 +157,9 @@ def test_pybullet_runs_on_after_a_failure(env_id):
 @pytest.mark.parametrize("before", [0, 1, 37])
 def test_a_restored_simulator_continues_bit_for_bit(env_id, limit, after_failure, before, tmp_path):
     settings = task(env_id, limit, after_failure=after_failure)
-    env = make_env(settings, 3, seed=3)
-    actions = random_actions(env, before + 40)
-    root = env.reset()
-    for action in actions[:before]:
-        _, root = env.step_and_maybe_reset(root.set("action", action))
-    save_state(tmp_path / "state", env.simulator_state())
-    whole, end = play(env, actions[before:], root=root)
-
-    state = load_state(tmp_path / "state")
-    fresh = make_env(settings, 3, seed=99)
-    assert fresh.restore_simulator(state)
-    again = fresh.simulator_state()
-    for key, value in state.items():
-        assert np.array_equal(again[key], value), key
-    continued, fresh_end = play(fresh, actions[before:], root=fresh.reset())
-    for key in KEYS:
-        assert torch.equal(whole[key], continued[key]), key
-    assert torch.equal(end["observation"], fresh_end["observation"])
-    assert whole["next", "done"].any() and not whole["next", "scored"].all()
+    env, fresh = make_env(settings, 3, seed=3), make_env(settings, 3, seed=99)
+    whole = rollouts.continued(env, fresh, before, tmp_path / "state", KEYS)
+    assert not whole["next", "scored"].all()
     env.close()
     fresh.close()
 

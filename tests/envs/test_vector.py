@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium import spaces
+from rollouts import BULLET, KEYS, continued, play, random_actions
 from tensordict import TensorDict
 from torchrl.collectors import Collector
 from torchrl.envs import EnvBase
@@ -16,35 +17,13 @@ from giril_rl.config.schema import TaskConfig
 from giril_rl.demos import record_demonstration
 from giril_rl.envs import GymVectorEnv, make_env
 from giril_rl.errors import UserError
-from giril_rl.files.checkpoint import load_state, save_state
 from giril_rl.rewards.actions import ActionEncoder
 from giril_rl.runs.randomness import stream_seed
-
-BULLET = "InvertedPendulumBulletEnv-v0"
-KEYS = ["observation", "action"] + [
-    ("next", name) for name in ("observation", "reward", "done", "terminated", "truncated")
-]
 
 
 def make(env_id, num_envs=3, *, seed=0, limit=None):
     task = TaskConfig(name="test", env_id=env_id, max_episode_steps=limit)
     return make_env(task, num_envs, seed)
-
-
-def random_actions(env, steps, seed=0):
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
-        return torch.stack([env.action_spec.rand() for _ in range(steps)])
-
-
-def play(env, actions, root=None, step=GymVectorEnv.step_and_maybe_reset):
-    """All transitions ``[N, T]`` and the root that would come next."""
-    root = env.reset() if root is None else root
-    steps = []
-    for action in actions:
-        transition, root = step(env, root.clone().set("action", action))
-        steps.append(transition.select(*KEYS).clone())
-    return torch.stack(steps, 1), root
 
 
 def gymnasium_loop(make_fn, actions, seed):
@@ -263,26 +242,8 @@ def test_recorded_data_stay_as_they_were(step_counter):
 )
 @pytest.mark.parametrize("before", [0, 1, 37])
 def test_a_restored_simulator_continues_bit_for_bit(env_id, limit, before, tmp_path):
-    env = make(env_id, seed=3, limit=limit)
-    actions = random_actions(env, before + 40)
-    root = env.reset()
-    for action in actions[:before]:
-        _, root = env.step_and_maybe_reset(root.set("action", action))
-    save_state(tmp_path / "state", env.simulator_state())
-    whole, end = play(env, actions[before:], root=root)
-
-    state = load_state(tmp_path / "state")
-    fresh = make(env_id, seed=99, limit=limit)
-    assert fresh.restore_simulator(state)
-    again = fresh.simulator_state()  # Saved once more before any step: a second interruption.
-    for key in ("seed", "episode", "steps", "observation"):
-        assert np.array_equal(again[key], state[key]), key
-    root = fresh.reset()
-    continued, fresh_end = play(fresh, actions[before:], root=root)
-    for key in KEYS:
-        assert torch.equal(whole[key], continued[key]), key
-    assert torch.equal(end["observation"], fresh_end["observation"])
-    assert whole["next", "done"].any()
+    env, fresh = make(env_id, seed=3, limit=limit), make(env_id, seed=99, limit=limit)
+    continued(env, fresh, before, tmp_path / "state")
     # Only the first reset stands in the middle of episodes.
     assert torch.equal(env.reset()["observation"], fresh.reset()["observation"])
     assert fresh.simulator_state()["steps"].tolist() == [0, 0, 0]

@@ -9,7 +9,7 @@ import yaml
 
 from giril_rl.cli.command_line import main
 from giril_rl.demos import Demonstration
-from giril_rl.files.checkpoint import load_state
+from giril_rl.runs.checkpoint import load_state
 from giril_rl.runs.metrics import read_metrics
 
 pytest.importorskip("ale_py")

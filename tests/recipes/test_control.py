@@ -5,12 +5,13 @@ import math
 
 import gymnasium
 import pytest
+from short_runs import rows, weights
 
 from giril_rl.cli.command_line import main
 from giril_rl.config.recipe_files import copy, find
 from giril_rl.config.schema import TaskConfig
 from giril_rl.envs import GymVectorEnv, make_env
-from giril_rl.files.checkpoint import load_state
+from giril_rl.runs.checkpoint import load_state
 from giril_rl.runs.metrics import read_metrics
 from giril_rl.runs.run import Run
 
@@ -63,17 +64,6 @@ def run(recipe, out, root, *more, code=0):
     by_key = {word.split("=")[0]: word for word in [*TINY, *more]}
     assert main(["run", recipe, f"out={out}", f"root={root}", *by_key.values()]) == code
     return json.loads((out / "result.json").read_text()) if code == 0 else None
-
-
-def weights(folder):
-    state = load_state(folder / "policy/model.safetensors")
-    return {name: value.tolist() for name, value in state.items()}
-
-
-def rows(folder):
-    """Metrics less what a clock says, in their order."""
-    found = read_metrics(folder / "metrics.jsonl")
-    return [{k: v for k, v in row.items() if "seconds" not in k} for row in found]
 
 
 def starts(seed, episodes):
@@ -183,8 +173,8 @@ def test_negated_and_centred_are_made_of_the_recipe_s_own_reward(root, tmp_path)
     for reward in ("negated_giril", "centred_giril", "noise"):
         run("control", tmp_path / reward, root, *plain, f"reward={reward}")
         fits = [load_state(tmp_path / name / "fit.safetensors") for name in ("giril", reward)]
-        for name, value in fits[0]["loss"].items():
-            assert value.equal(fits[1]["loss"][name]), name
+        for name, value in fits[0]["fit"]["loss"].items():
+            assert value.equal(fits[1]["fit"]["loss"][name]), name
     paid = first_batch(tmp_path / "giril")
     assert first_batch(tmp_path / "negated_giril") == pytest.approx(-paid, rel=1e-5)
     rows = read_metrics(tmp_path / "centred_giril" / "metrics.jsonl")

@@ -24,7 +24,7 @@ from second_device import DEVICE, second_device
 from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import TransformedEnv
 
-from giril_rl.files.checkpoint import load_state, save_state
+from giril_rl.runs.checkpoint import load_state, save_state
 from giril_rl.transforms import IntrinsicReward
 
 

@@ -13,7 +13,7 @@ from tensordict.nn import TensorDictModule
 from torchrl.envs import EnvBase
 
 from giril_rl.envs import AtariEnv, GymVectorEnv
-from giril_rl.envs.atari_game import AtariGame
+from giril_rl.envs.atari_preprocessing import AtariGame
 
 MakeEnv = Callable[..., gymnasium.Env]
 

@@ -7,7 +7,7 @@ from reward_data import SPECS, sets, total, train
 from torch.distributions import Independent, Normal, kl_divergence
 
 from giril_rl.errors import UserError
-from giril_rl.graphs.traced import TracedGradients
+from giril_rl.graphs import TracedGradients
 from giril_rl.rewards import BottleneckLoss, BottleneckReward
 
 

@@ -21,7 +21,7 @@ from torch import nn
 from torchrl.data import Bounded, Categorical
 
 from giril_rl.errors import UserError
-from giril_rl.graphs.traced import TracedGradients
+from giril_rl.graphs.gradients import TracedGradients
 from giril_rl.rewards import (
     ActionEncoder,
     CuriosityReward,

@@ -11,7 +11,7 @@ from torchrl.data import Bounded, Categorical
 from torchrl.objectives import GAILLoss
 
 from giril_rl.errors import UserError
-from giril_rl.graphs.traced import TracedGradients
+from giril_rl.graphs.gradients import TracedGradients
 from giril_rl.rewards import (
     ActionEncoder,
     BottleneckLoss,

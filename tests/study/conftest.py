@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from giril_rl.training import finished
+from giril_rl.runs import finished
 
 RECIPE = '''"""Fake: a result after no work; `how` says how to fail."""
 
@@ -22,7 +22,7 @@ import yaml
 
 from giril_rl.config.schema import RunConfig, knob
 from giril_rl.errors import UserError
-from giril_rl.runs.naming import config_hash
+from giril_rl.runs.identity import config_hash
 
 HOW = ("well", "user", "bug", "once", "killed", "slow", "stubborn")
 

@@ -82,7 +82,7 @@ def test_a_cluster_gives_the_same_results_though_a_worker_dies(study):
     status = json.loads(Path("there/studies/mine/status.json").read_text())
     assert sorted(run["attempts"] for run in status["runs"]) == [1, 2]
 
-    from giril_rl.files.checkpoint import load_state
+    from giril_rl.runs.checkpoint import load_state
     from giril_rl.runs.metrics import read_metrics
 
     for here in Path("here").rglob("result.json"):

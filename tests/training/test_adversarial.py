@@ -1,19 +1,16 @@
 """The discriminator beside the policy: by itself, and in PPO's loop through ``learn_reward``."""
 
-import signal
-
 import gymnasium
-import numpy as np
 import pytest
 import torch
+from short_runs import Garbage, Killed, rows, stopped
 from tensordict import TensorDict
 from torchrl.data import Bounded, Categorical
 from torchrl.envs import Compose
 
 from giril_rl.config.schema import PPOConfig
 from giril_rl.envs import GymVectorEnv
-from giril_rl.files.checkpoint import load_state, save_state
-from giril_rl.policies.agent import make_agent
+from giril_rl.policies.making import make_agent
 from giril_rl.rewards import (
     AdversarialConfig,
     BottleneckLoss,
@@ -21,11 +18,12 @@ from giril_rl.rewards import (
     DiscriminatorLoss,
     DiscriminatorReward,
 )
+from giril_rl.runs.checkpoint import load_state, save_state
 from giril_rl.runs.interrupt import Interrupted
-from giril_rl.runs.metrics import read_metrics
 from giril_rl.runs.run import Run
-from giril_rl.training.adversarial import AdversarialLearner
-from giril_rl.training.ppo import train_ppo
+from giril_rl.training.loop import train_policy
+from giril_rl.training.ppo import PPO
+from giril_rl.training.reward_trainers import AdversarialTrainer
 from giril_rl.transforms import IntrinsicReward, ReturnScaling
 
 SPECS = {"box": Bounded(-1.0, 1.0, shape=(4, 1)), "discrete": Categorical(2, shape=(4,))}
@@ -52,7 +50,7 @@ def make(method="gail", *, spec=SPECS["box"], expert=None, seed=0, dim=3, **kwar
     else:
         loss = BottleneckLoss(reward, penalty=cfg.penalty, beta_step=0.1, beta=0.5)
     expert = pairs(20, seed=9) if expert is None else expert
-    return AdversarialLearner(loss, expert, cfg, seed=seed), reward
+    return AdversarialTrainer(loss, expert, cfg, seed=seed), reward
 
 
 def assert_equal(found, expected, path=""):
@@ -135,9 +133,9 @@ def test_minibatches_come_from_both_sets(monkeypatch):
     for which, data in ((0, pairs(20, seed=9)), (2, batch.reshape(-1))):
         known = torch.cat((data["observation"], data["action"]), 1).tolist()
         drawn = [torch.cat(inputs[which : which + 2], 1).tolist() for inputs in seen]
-        for rows in drawn:
-            assert all(row in known for row in rows)
-            assert len({tuple(row) for row in rows}) == 16
+        for lines in drawn:
+            assert all(row in known for row in lines)
+            assert len({tuple(row) for row in lines}) == 16
         assert drawn[0] != drawn[1]
 
 
@@ -192,23 +190,6 @@ BATCH = 4 * 32
 ENVS = {"discrete": "CartPole-v1", "box": "Pendulum-v1"}
 
 
-class Garbage(gymnasium.Wrapper):
-    """The environment with another reward."""
-
-    def __init__(self, env, kind):
-        super().__init__(env)
-        self.rng = np.random.default_rng(7)
-        self.kind = kind
-
-    def step(self, action):
-        observation, reward, *rest = self.env.step(action)
-        if self.kind == "noise":
-            reward = 1e3 * self.rng.normal()
-        elif self.kind == "nan":
-            reward = float("nan")
-        return observation, reward, *rest
-
-
 def train(folder, *, method="gail", kind="discrete", garbage=None, steps=4 * BATCH, learn=True):
     """Trains in ``folder`` with objects of its own; the checkpoint."""
 
@@ -222,15 +203,13 @@ def train(folder, *, method="gail", kind="discrete", garbage=None, steps=4 * BAT
     learner, reward = make(method, spec=env.action_spec, expert=expert, dim=dim, penalty=1.0)
     relabel = Compose(IntrinsicReward(reward), ReturnScaling(0.99))
     with Run.open(folder, {}, recipe="x") as run:
-        train_ppo(
+        train_policy(
             env,
-            agent,
+            PPO(agent, CFG, steps=steps),
             relabel,
-            CFG,
-            steps=steps,
             seed=0,
             run=run,
-            learn_reward=learner if learn else None,
+            reward_trainer=learner if learn else None,
         )
         state = run.load("ppo")
     env.close()
@@ -238,35 +217,13 @@ def train(folder, *, method="gail", kind="discrete", garbage=None, steps=4 * BAT
     return state
 
 
-def rows(folder):
-    """Metrics less what a clock says."""
-    return [
-        {key: value for key, value in row.items() if "seconds" not in key}
-        for row in read_metrics(folder / "metrics.jsonl")
-    ]
-
-
-class Killed(Exception):
-    """Stands for kill -9: nothing is saved after it."""
-
-
 @pytest.mark.parametrize(("method", "kind"), [("gail", "discrete"), ("vail", "box")])
 def test_a_run_stopped_again_and_again_ends_bit_for_bit_as_an_undisturbed_one(
-    method, kind, tmp_path, monkeypatch
+    method, kind, tmp_path
 ):
     expected = train(tmp_path / "whole", method=method, kind=kind)
-    log = Run.log
     for number, how in ((1, Killed), (1, Interrupted), (3, Killed), (3, Interrupted)):
-        with monkeypatch.context() as patch, pytest.raises(how):
-
-            def log_and_stop(self, step, values, *, phase, number=number, how=how):
-                log(self, step, values, phase=phase)
-                if step == number * BATCH:
-                    if how is Killed:
-                        raise Killed
-                    signal.raise_signal(signal.SIGINT)
-
-            patch.setattr(Run, "log", log_and_stop)
+        with stopped(how, number * BATCH):
             train(tmp_path / "run", method=method, kind=kind)
         torch.manual_seed(1234 + number)
     found = train(tmp_path / "run", method=method, kind=kind)
@@ -280,11 +237,9 @@ def test_neither_policy_nor_discriminator_sees_the_true_reward(kind, tmp_path):
     expected = train(tmp_path / "true", kind=kind)
     for garbage in ("noise", "nan"):
         found = train(tmp_path / garbage, kind=kind, garbage=garbage)
-        for name in ("optimizer", "reward_learner", "rng"):
+        # Not the tracker, which counts true returns for the log.
+        for name in ("algorithm", "transform", "reward_trainer", "rng"):
             assert_equal(found[name], expected[name])
-        for name, value in expected["parts"].items():
-            if not name.startswith("tracker."):  # Which counts true returns, for the log.
-                assert torch.equal(found["parts"][name], value), name
     returns = {rows(tmp_path / k)[-1]["train/return_mean"] for k in ("true", "noise", "nan")}
     assert len(returns) == 3
 
@@ -294,11 +249,10 @@ def test_the_discriminator_learns_before_the_batch_is_relabelled(tmp_path):
         train(tmp_path / "a", steps=BATCH),
         train(tmp_path / "b", learn=False, steps=BATCH),
     )
-    key = "relabel.transforms.0.module.network.0.weight"
-    assert key in with_it["parts"]
-    assert not torch.equal(with_it["parts"][key], without["parts"][key])
+    key = "transforms.0.module.network.0.weight"
+    assert not torch.equal(with_it["transform"][key], without["transform"][key])
     paid = [rows(tmp_path / name)[0]["ppo/reward_mean"] for name in "ab"]
     assert paid[0] != paid[1]
-    assert without["reward_learner"] is None
+    assert without["reward_trainer"] is None
     assert "discriminator/loss_expert" in rows(tmp_path / "a")[0]
     assert "discriminator/loss_expert" not in rows(tmp_path / "b")[0]

@@ -1,21 +1,20 @@
-import signal
-
 import pytest
 import torch
 import torch.nn.functional as F
+from short_runs import Killed, stopped
 from tensordict import TensorDict
 from torchrl.data import Bounded, Categorical, OneHot
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from giril_rl.config.schema import BCConfig
 from giril_rl.errors import UserError
-from giril_rl.files.checkpoint import load_state
-from giril_rl.policies.policy import NORMALISED, ActorCritic
+from giril_rl.policies.actor_critic import NORMALISED, ActorCritic
+from giril_rl.runs.checkpoint import load_state
 from giril_rl.runs.interrupt import Interrupted
 from giril_rl.runs.metrics import read_metrics
 from giril_rl.runs.run import Run
-from giril_rl.training import clone
-from giril_rl.training.clone import clone_behaviour
+from giril_rl.training import cloning
+from giril_rl.training.cloning import clone_behaviour
 
 BOX, DISCRETE = Bounded(-1, 1, shape=(1, 2)), Categorical(3, shape=(1,))
 GAIN = torch.tensor([[0.3, -0.2], [0.1, 0.4], [0.0, 0.2]])
@@ -49,7 +48,7 @@ def cloned(folder, fitted=None, held_out=None, *, agent=None, seed=0, spec=BOX, 
     fitted = pairs(40, spec=spec) if fitted is None else fitted
     with Run.open(folder, {}, recipe="x") as run:
         cfg = BCConfig(**settings)
-        trained = clone_behaviour(agent, fitted, cfg, seed=seed, run=run, held_out=held_out)
+        trained = clone_behaviour(agent, fitted, cfg, seed=seed, run=run, validation=held_out)
     assert trained.steps == 0 and trained.seconds > 0
     return agent, read_metrics(folder / "metrics.jsonl")
 
@@ -158,7 +157,7 @@ def test_one_step_by_hand(tmp_path):
 def test_the_step_size_decreases_to_zero(tmp_path):
     cloned(tmp_path, stop="fixed", steps=50, lr=0.5)
     state = load_state(tmp_path / "bc.safetensors")
-    assert state["optimizer"]["param_groups"][0]["lr"] == pytest.approx(0.5 / 50)
+    assert state["fit"]["optimizer"]["param_groups"][0]["lr"] == pytest.approx(0.5 / 50)
 
 
 # Normalisation and deviation
@@ -264,29 +263,15 @@ def test_seeds_and_data_decide_everything(tmp_path):
     assert same(whole, cloned(tmp_path / "whole1", stop="fixed", batch=40, seed=1)[0])
 
 
-class Killed(Exception):
-    """Stands for kill -9: nothing is saved after it."""
-
-
 @pytest.mark.parametrize("stop", ["held_out", "fixed"])
 def test_a_cloning_stopped_again_and_again_ends_bit_for_bit_as_an_undisturbed_one(
     stop, tmp_path, monkeypatch
 ):
-    monkeypatch.setattr(clone, "CHECKPOINT_EVERY", 20)
+    monkeypatch.setattr(cloning, "CHECKPOINT_EVERY", 20)
     settings = {"stop": stop, "batch": 4, "steps": 60, "weight_decay": 0.1}
     whole, rows = noisy(tmp_path / "whole", **settings)
-    log = Run.log
     for number, how in ((1, Killed), (1, Interrupted), (3, Killed), (6, Interrupted)):
-        with monkeypatch.context() as patch, pytest.raises(how):
-
-            def log_and_stop(self, step, values, *, phase, number=number, how=how):
-                log(self, step, values, phase=phase)
-                if step >= number * 10:
-                    if how is Killed:
-                        raise Killed
-                    signal.raise_signal(signal.SIGINT)
-
-            patch.setattr(Run, "log", log_and_stop)
+        with stopped(how, number * 10):
             noisy(tmp_path / "run", **settings)
         torch.manual_seed(99)
     agent, found = noisy(tmp_path / "run", **settings)

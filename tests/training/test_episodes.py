@@ -2,7 +2,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from giril_rl.files.checkpoint import load_state, save_state
+from giril_rl.runs.checkpoint import load_state, save_state
 from giril_rl.training.episodes import EpisodeTracker
 
 

@@ -8,9 +8,9 @@ import torch
 
 from giril_rl.config.schema import TaskConfig
 from giril_rl.envs import make_env
-from giril_rl.policies.policy import ActorCritic
+from giril_rl.policies.actor_critic import ActorCritic
 from giril_rl.runs.randomness import stream_seed
-from giril_rl.training.evaluate import EPISODES_AT_ONCE, evaluate, evaluate_both
+from giril_rl.training.scoring import EPISODES_AT_ONCE, evaluate, evaluate_both
 
 COUNTER = TaskConfig(name="counter", env_id="StepCounter-v0")
 CARTPOLE = TaskConfig(name="cartpole", env_id="CartPole-v1")
@@ -64,7 +64,7 @@ def test_episodes_do_not_depend_on_how_many_are_played_at_once(deterministic, mo
 
     def played(episodes, at_once):
         # The package has a function of the module's name.
-        module = sys.modules["giril_rl.training.evaluate"]
+        module = sys.modules["giril_rl.training.scoring"]
         monkeypatch.setattr(module, "EPISODES_AT_ONCE", at_once)
         return evaluate(agent, COUNTER, episodes=episodes, seed=4, deterministic=deterministic)
 
@@ -133,8 +133,8 @@ def test_a_thousand_episodes_of_pybullet_fit_into_memory():
         "import resource, torch\n"
         "from giril_rl.config.schema import TaskConfig\n"
         "from giril_rl.envs import make_env\n"
-        "from giril_rl.policies.policy import ActorCritic\n"
-        "from giril_rl.training.evaluate import evaluate\n"
+        "from giril_rl.policies import ActorCritic\n"
+        "from giril_rl.training.scoring import evaluate\n"
         "task = TaskConfig(name='pendulum', env_id='InvertedPendulumBulletEnv-v0')\n"
         "env = make_env(task, 1, seed=0)\n"
         "agent = ActorCritic(5, env.action_spec, hidden=(16,))\n"

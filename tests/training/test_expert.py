@@ -7,9 +7,9 @@ from tensordict.nn import TensorDictModule
 
 from giril_rl.config.schema import DemoConfig, ExpertConfig, RunConfig, TaskConfig
 from giril_rl.demos import Demonstration
-from giril_rl.demos.task import as_recorded_task
+from giril_rl.envs import as_recorded_task
 from giril_rl.errors import UserError
-from giril_rl.training import check_inputs, expert, obtain_demonstration
+from giril_rl.training import check_inputs, demonstrations, obtain_demonstration
 
 COUNTER = TaskConfig(name="counter", env_id="StepCounter-v0")
 BREAKOUT = TaskConfig(name="breakout", env_id="ALE/Breakout-v5")
@@ -32,8 +32,8 @@ class Random:
 @pytest.fixture
 def obtain(monkeypatch, tmp_path):
     result = {"config_hash": "0123456789ab", "return_mean": 3.5, "seed": 7, "env_steps": 9}
-    monkeypatch.setattr(expert, "obtain_expert", lambda *_: (Path("expert"), result))
-    monkeypatch.setattr(expert, "load_agent", lambda *_: Random(actions=4))
+    monkeypatch.setattr(demonstrations, "obtain_expert", lambda *_: (Path("expert"), result))
+    monkeypatch.setattr(demonstrations, "load_agent", lambda *_: Random(actions=4))
 
     def obtain(task, demo):
         config = RunConfig(task=task, root=str(tmp_path), steps=2000)
@@ -44,13 +44,13 @@ def obtain(monkeypatch, tmp_path):
 
 
 def test_hashes_are_those_of_before_there_were_lives():
-    assert expert._identity(COUNTER, DemoConfig(seed=0), "0123456789ab") == "7ed61d6c8859"
+    assert demonstrations._identity(COUNTER, DemoConfig(seed=0), "0123456789ab") == "7ed61d6c8859"
     task = replace(COUNTER, horizon="fixed")
     demo = DemoConfig(
         length=None, episodes=2, subsample=1, lives="all", seed=0
     )  # Nothing to a vector.
     recorded = as_recorded_task(task, demo.lives)
-    assert expert._identity(recorded, demo, "0123456789ab") == "36962a564bd0"
+    assert demonstrations._identity(recorded, demo, "0123456789ab") == "36962a564bd0"
 
 
 def test_lives_decide_where_an_atari_episode_ends(obtain):
@@ -92,7 +92,9 @@ def test_a_given_demonstration_must_fit_the_task(obtain, tmp_path):
 def test_a_demonstration_is_recorded_once(obtain, monkeypatch):
     pytest.importorskip("ale_py")
     first, _ = obtain(BREAKOUT, LIFE)
-    monkeypatch.setattr(expert, "record_demonstration", lambda *_, **__: pytest.fail("again"))
+    monkeypatch.setattr(
+        demonstrations, "record_demonstration", lambda *_, **__: pytest.fail("again")
+    )
     again, (folder,) = obtain(BREAKOUT, LIFE)
     assert (again.transitions == first.transitions).all()
     assert isinstance(Demonstration.load(folder), Demonstration)

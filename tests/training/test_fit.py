@@ -1,7 +1,6 @@
-import signal
-
 import pytest
 import torch
+from short_runs import Killed, stopped
 from tensordict import TensorDict
 from torch import nn
 from torchrl.data import Bounded, Categorical
@@ -16,7 +15,7 @@ from giril_rl.rewards import (
 from giril_rl.runs.interrupt import Interrupted
 from giril_rl.runs.metrics import read_metrics
 from giril_rl.runs.run import Run
-from giril_rl.training import fit
+from giril_rl.training import fitting
 
 SPECS = {"box": Bounded(-1, 1, shape=(1, 1)), "discrete": Categorical(3, shape=(1,))}
 TERMS = ("reconstruction", "kl", "action")
@@ -45,7 +44,7 @@ def fitted(folder, *, kind="box", data=None, held_out=None, seed=0, model_seed=0
     data = transitions(100, kind=kind) if data is None else data
     loss = GenerativeRewardLoss(reward)
     with Run.open(folder, {}, recipe="x") as run:
-        fit.fit_reward(loss, data, cfg, seed=seed, run=run, held_out=held_out)
+        fitting.fit_reward(loss, data, cfg, seed=seed, run=run, validation=held_out)
     return dict(loss.named_parameters()), read_metrics(folder / "metrics.jsonl")
 
 
@@ -115,31 +114,17 @@ def test_seeds_and_data_decide_everything(tmp_path):
     assert same(first, fitted(tmp_path / "log", log_every=7)[0])
 
 
-class Killed(Exception):
-    """Stands for kill -9: nothing is saved after it."""
-
-
 @pytest.mark.parametrize("log_every", [10, 7])
 def test_a_fit_stopped_again_and_again_ends_bit_for_bit_as_an_undisturbed_one(
     log_every, tmp_path, monkeypatch
 ):
-    monkeypatch.setattr(fit, "CHECKPOINT_EVERY", 20)
+    monkeypatch.setattr(fitting, "CHECKPOINT_EVERY", 20)
     held_out = transitions(20, seed=5)
     weights, rows = fitted(tmp_path / "whole", held_out=held_out, log_every=log_every)
-    log = Run.log
     stops = [(1, Killed), (1, Interrupted), (4, Killed), (5, Interrupted), (6, Killed)]
     stops.append((60 / log_every, Interrupted))  # At the last step.
     for number, how in stops:
-        with monkeypatch.context() as patch, pytest.raises(how):
-
-            def log_and_stop(self, step, values, *, phase, number=number, how=how):
-                log(self, step, values, phase=phase)
-                if step >= number * log_every:
-                    if how is Killed:
-                        raise Killed
-                    signal.raise_signal(signal.SIGINT)
-
-            patch.setattr(Run, "log", log_and_stop)
+        with stopped(how, number * log_every):
             fitted(tmp_path / "run", held_out=held_out, log_every=log_every)
         torch.manual_seed(99)
     found, found_rows = fitted(tmp_path / "run", held_out=held_out, log_every=log_every)
@@ -183,7 +168,7 @@ def fit_frames(folder, *, loss=None, held_out=None, **kwargs):
     cfg = FitConfig(**{"steps": 6, "batch": 4, "lr": 1e-3, "log_every": 2, **kwargs})
     loss = pixel_loss() if loss is None else loss
     with Run.open(folder, {}, recipe="x") as run:
-        fit.fit_reward(loss, frames(8), cfg, seed=0, run=run, held_out=held_out)
+        fitting.fit_reward(loss, frames(8), cfg, seed=0, run=run, validation=held_out)
     return dict(loss.state_dict()), read_metrics(folder / "metrics.jsonl")
 
 
@@ -222,20 +207,10 @@ def test_the_logged_loss_of_frames_is_that_of_eval_mode(tmp_path):
 
 @pytest.mark.parametrize("compile", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_a_fit_of_frames_is_resumed_bit_for_bit_with_its_statistics(compile, tmp_path, monkeypatch):
-    monkeypatch.setattr(fit, "CHECKPOINT_EVERY", 4)
+    monkeypatch.setattr(fitting, "CHECKPOINT_EVERY", 4)
     expected, expected_rows = fit_frames(tmp_path / "whole", compile=compile)
-    log = Run.log
     for step, how in ((2, Interrupted), (6, Killed)):
-        with monkeypatch.context() as patch, pytest.raises(how):
-
-            def log_and_stop(self, at, values, *, phase, step=step, how=how):
-                log(self, at, values, phase=phase)
-                if at == step:
-                    if how is Killed:
-                        raise Killed
-                    signal.raise_signal(signal.SIGINT)
-
-            patch.setattr(Run, "log", log_and_stop)
+        with stopped(how, step):
             fit_frames(tmp_path / "run", compile=compile)
         torch.manual_seed(99)
     found, found_rows = fit_frames(tmp_path / "run", compile=compile)

@@ -16,9 +16,9 @@ from giril_rl.config.recipe_config import config_class
 from giril_rl.config.recipe_files import find
 from giril_rl.demos import Demonstration, shipped_demonstrations
 from giril_rl.errors import UserError
-from giril_rl.runs.naming import config_hash
-from giril_rl.training import expert, fitted
-from giril_rl.training.fitted import find_demonstration
+from giril_rl.runs.identity import config_hash
+from giril_rl.training import demonstrations, players
+from giril_rl.training.demonstrations import find_demonstration
 
 pytest.importorskip("ale_py")
 KEY = ("next", "intrinsic_reward")
@@ -69,10 +69,10 @@ def transitions(length=6):
 def test_the_demonstration_is_found_and_never_made(made, tmp_path, monkeypatch):
     folder, cfg = made("giril")
     made_by = "0123456789ab"
-    monkeypatch.setattr(fitted, "config_hash", lambda _: made_by)
+    monkeypatch.setattr(demonstrations, "config_hash", lambda _: made_by)
     assert find_demonstration(folder, tmp_path) is None
     assert {path.name for path in tmp_path.iterdir()} == {"giril"}
-    place = tmp_path / expert.demonstration_place(cfg, cfg.demo, made_by)
+    place = tmp_path / demonstrations.demonstration_place(cfg, cfg.demo, made_by)
     Demonstration(transitions()).save(place)
     found = find_demonstration(folder, tmp_path)
     assert torch.equal(found.transitions["observation"], transitions()["observation"])
@@ -95,7 +95,7 @@ def test_a_demonstration_or_an_expert_may_be_given_by_its_path(made, tmp_path):
     assert len(find_demonstration(folder, tmp_path)) == 6
     shutil.rmtree(tmp_path / "giril")
     folder, cfg = made("giril", f"expert.path={tmp_path}/expert")
-    place = tmp_path / expert.demonstration_place(cfg, cfg.demo, "ba9876543210")
+    place = tmp_path / demonstrations.demonstration_place(cfg, cfg.demo, "ba9876543210")
     (tmp_path / "given").rename(tmp_path / "moved")
     Demonstration.load(tmp_path / "moved").save(place)
     assert find_demonstration(folder, tmp_path) is None
@@ -108,8 +108,8 @@ def test_a_demonstration_or_an_expert_may_be_given_by_its_path(made, tmp_path):
 def test_a_relative_root_is_found_from_any_current_directory(made, tmp_path, monkeypatch, current):
     folder, cfg = made("giril")
     set_to(folder, "root", "study/mine")
-    made_by = config_hash(expert.expert_settings(cfg, cfg.expert))
-    place = expert.demonstration_place(cfg, cfg.demo, made_by)
+    made_by = config_hash(players.expert_settings(cfg, cfg.expert))
+    place = demonstrations.demonstration_place(cfg, cfg.demo, made_by)
     Demonstration(transitions()).save(tmp_path / "study/mine" / place)
     (tmp_path / "giril").rename(tmp_path / "study/giril")
     folder = tmp_path / "study" / folder.relative_to(tmp_path)
@@ -126,14 +126,14 @@ def test_a_relative_root_is_found_from_any_current_directory(made, tmp_path, mon
 def test_nothing_outside_the_folder_is_read(made, tmp_path, monkeypatch, key, kind):
     folder, cfg = made("giril")
     within, outside = tmp_path / "giril", tmp_path / "outside"
-    made_by = config_hash(expert.expert_settings(cfg, cfg.expert))
+    made_by = config_hash(players.expert_settings(cfg, cfg.expert))
     demo = outside
     if key == "expert.path":
         outside.mkdir()
         (outside / "result.json").write_text(json.dumps(RESULT))
-        demo = within / expert.demonstration_place(cfg, cfg.demo, RESULT["config_hash"])
+        demo = within / demonstrations.demonstration_place(cfg, cfg.demo, RESULT["config_hash"])
     elif key == "root":
-        demo = outside / expert.demonstration_place(cfg, cfg.demo, made_by)
+        demo = outside / demonstrations.demonstration_place(cfg, cfg.demo, made_by)
     Demonstration(transitions()).save(demo)
     (within / "link").symlink_to(outside)
     value = {"absolute": str(outside), "up": "../outside", "link": "link"}[kind]

@@ -10,12 +10,12 @@ from torchrl.envs import Compose
 
 from giril_rl.config.schema import EvalConfig, PPOConfig, RunConfig, TaskConfig
 from giril_rl.envs import GymVectorEnv
-from giril_rl.files.checkpoint import load_state
+from giril_rl.runs.checkpoint import load_state
+from giril_rl.runs.finished import read_result
 from giril_rl.runs.metrics import read_metrics
-from giril_rl.runs.result_file import read_result_file
-from giril_rl.training import RandomPolicy, Run, Trained, finish_run, make_agent, train_ppo
+from giril_rl.training import PPO, RandomPolicy, Run, Trained, finish_run, make_agent
 from giril_rl.training.episodes import EpisodeTracker
-from giril_rl.training.ppo import forget_episodes
+from giril_rl.training.loop import forget_episodes, train_policy
 from giril_rl.transforms import ReturnScaling
 
 BATCH = 4 * 32
@@ -55,8 +55,8 @@ def train(step_counter, folder, monkeypatch, *, stop=None, saves=False):
     with monkeypatch.context() as patch, Run.open(folder, {}, recipe="x") as run:
         patch.setattr(Run, "log", log_or_stop)
         patch.setattr(Run, "save", save_or_stop)
-        return train_ppo(
-            env, make_agent(env, CFG, 0), nn.Identity(), CFG, steps=6 * BATCH, seed=0, run=run
+        return train_policy(
+            env, PPO(make_agent(env, CFG, 0), CFG, steps=6 * BATCH), nn.Identity(), seed=0, run=run
         )
 
 
@@ -64,7 +64,7 @@ def test_it_goes_on_from_fresh_episodes_and_counts_how_often(step_counter, tmp_p
     with pytest.raises(Stopped):
         train(step_counter, tmp_path, monkeypatch, stop=2, saves=True)
     assert load_state(tmp_path / "ppo.safetensors")["inexact_resumes"] == 0
-    warning = r"did not come back .* at 256 steps from fresh episodes, .* inexact_resumes"
+    warning = r"did not come back .* at 256 steps with fresh episodes, .* inexact_resumes"
     # What is made after this one's start is lost with it, and so does not count.
     with pytest.warns(UserWarning, match=warning), pytest.raises(Stopped):
         train(step_counter, tmp_path, monkeypatch, stop=3)
@@ -81,20 +81,6 @@ def test_it_goes_on_from_fresh_episodes_and_counts_how_often(step_counter, tmp_p
     assert lengths == [20.0] * 6
 
 
-def test_an_unfinished_run_of_an_earlier_version_has_no_count(step_counter, tmp_path, monkeypatch):
-    load = Run.load
-
-    def without_count(self, name):
-        state = load(self, name)
-        return None if state is None else {k: v for k, v in state.items() if "inexact" not in k}
-
-    with pytest.raises(Stopped):
-        train(step_counter, tmp_path, monkeypatch, stop=2, saves=True)
-    monkeypatch.setattr(Run, "load", without_count)
-    with pytest.warns(UserWarning, match="fresh episodes"):
-        assert train(step_counter, tmp_path, monkeypatch).inexact_resumes == 1
-
-
 def test_the_sums_of_lost_episodes_are_forgotten():
     done, never = ReturnScaling(0.9, reset="done"), ReturnScaling(0.9)
     tracker = EpisodeTracker(2)
@@ -102,7 +88,7 @@ def test_the_sums_of_lost_episodes_are_forgotten():
         scaling.running_return = torch.tensor([2.0, 3.0], dtype=torch.float64)
     tracker.running_return.fill_(5.0)
     tracker.running_length.fill_(7)
-    forget_episodes(nn.ModuleDict({"tracker": tracker, "relabel": Compose(done, never)}))
+    forget_episodes(tracker, Compose(done, never))
     assert not tracker.running_return.any() and not tracker.running_length.any()
     assert done.running_return.tolist() == [0.0, 0.0]
     assert never.running_return.tolist() == [2.0, 3.0]  # It knows of no episodes.
@@ -112,5 +98,5 @@ def test_result_json_says_it(tmp_path):
     task = TaskConfig(name="cartpole", env_id="CartPole-v1")
     cfg = RunConfig(task=task, eval=EvalConfig(episodes=1))
     with Run.open(tmp_path, {}, recipe="x") as run:
-        finish_run(run, cfg, RandomPolicy.of_task(task), Trained(0, 1.0, 3), method="x")
-    assert read_result_file(tmp_path / "result.json")["inexact_resumes"] == 3
+        finish_run(run, cfg, RandomPolicy.of_task(task), Trained(0, 1.0, 3))
+    assert read_result(tmp_path)["inexact_resumes"] == 3

@@ -10,7 +10,7 @@ from frame_losses import CASES
 from tensordict import TensorDict
 from torch import nn
 
-from giril_rl.graphs.traced import TracedGradients
+from giril_rl.graphs import TracedGradients
 
 
 @pytest.mark.parametrize("name", CASES)

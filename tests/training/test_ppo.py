@@ -1,10 +1,10 @@
-import signal
 from functools import partial
 
 import gymnasium
 import numpy as np
 import pytest
 import torch
+from short_runs import Garbage, Killed, rows, stopped
 from tensordict import TensorDict
 from torch import nn
 from torchrl.data import Bounded, Categorical, OneHot
@@ -13,15 +13,15 @@ from torchrl.envs import Compose
 from giril_rl.config.schema import PPOConfig, TaskConfig
 from giril_rl.envs import GymVectorEnv, make_env
 from giril_rl.errors import UserError
-from giril_rl.files.checkpoint import load_state
-from giril_rl.policies.agent import make_agent
-from giril_rl.policies.pixel_policy import PixelActorCritic
-from giril_rl.policies.policy import NORMALISED, ActorCritic
+from giril_rl.policies.actor_critic import NORMALISED, ActorCritic
+from giril_rl.policies.making import make_agent
+from giril_rl.policies.pixel_actor_critic import PixelActorCritic
 from giril_rl.rewards import GenerativeReward
+from giril_rl.runs.checkpoint import load_state
 from giril_rl.runs.interrupt import Interrupted
-from giril_rl.runs.metrics import read_metrics
 from giril_rl.runs.run import Run
-from giril_rl.training.ppo import PPOLearner, train_ppo
+from giril_rl.training.loop import train_policy
+from giril_rl.training.ppo import PPO
 from giril_rl.transforms import BatchMeanReward, IntrinsicReward, ReturnScaling
 
 BULLET = "InvertedPendulumBulletEnv-v0"
@@ -45,14 +45,6 @@ def learned_reward(env, *, beta=1.0, batch_mean=True, seed=0):
     )
     mean = [BatchMeanReward()] if batch_mean else []
     return Compose(IntrinsicReward(reward), *mean, ReturnScaling(0.99))
-
-
-def rows(folder):
-    """Metrics less what a clock says."""
-    return [
-        {key: value for key, value in row.items() if "seconds" not in key}
-        for row in read_metrics(folder / "metrics.jsonl")
-    ]
 
 
 def assert_equal(found, expected, path=""):
@@ -130,7 +122,7 @@ def test_advantages_are_those_of_a_loop(gamma, lmbda):
     data = collected(agent)
     advantage, target = gae_by_hand(agent, data, gamma, lmbda)
     cfg = PPOConfig(gamma=gamma, lmbda=lmbda, minibatch=40, epochs=1)
-    PPOLearner(agent, cfg, total_steps=1).learn(data, 0)
+    PPO(agent, cfg, steps=1).update(data)
     # Standardised over the whole batch, whatever the minibatches.
     standardised = (advantage - advantage.mean()) / advantage.std(ddof=1)
     found = data["advantage"][..., 0].numpy()
@@ -149,7 +141,7 @@ def test_a_truncated_episode_bootstraps_from_its_true_terminal_observation(step_
         data = env.rollout(7, agent.acting(), break_when_any_done=False).contiguous()
         data["next", "reward"].zero_()
         cfg = PPOConfig(gamma=0.5, lmbda=0.0, minibatch=7, epochs=1)
-        PPOLearner(agent, cfg, total_steps=1).learn(data, 0)
+        PPO(agent, cfg, steps=1).update(data)
         return data["value_target"].flatten().tolist()
 
     # The third step ends in step 3, whose value counts after a time limit and not after a failure.
@@ -165,13 +157,13 @@ def learner_and_batch(**kwargs):
     torch.manual_seed(0)
     agent = ActorCritic(4, make("CartPole-v1").action_spec, hidden=(16,))
     cfg = config(minibatch=40, **kwargs)
-    return PPOLearner(agent, cfg, total_steps=1000), collected(agent)
+    return PPO(agent, cfg, steps=1000), collected(agent)
 
 
 def test_the_first_minibatch_has_ratio_one():
     learner, data = learner_and_batch(epochs=1)
     learner.cfg.minibatch = 120
-    losses = learner.learn(data, 0)
+    losses = learner.update(data)
     assert losses["clip_fraction"] == 0.0
     assert abs(losses["kl_approx"]) < 1e-6
     # With ratio 1 the objective is minus the mean normalised advantage, which is 0.
@@ -195,7 +187,7 @@ def test_units_of_the_action_do_not_matter(step_counter, normalise, tmp_path):
         env = GymVectorEnv(lambda: wrapper(step_counter()), 4)
         agent = make_agent(env, config(normalise_observations=normalise), seed=0)
         with Run.open(tmp_path / name, {}, recipe="x") as run:
-            train_ppo(env, agent, Compose(), config(), steps=3 * BATCH, seed=0, run=run)
+            train_policy(env, PPO(agent, config(), steps=3 * BATCH), Compose(), seed=0, run=run)
         return agent.state_dict()
 
     assert_equal(dict(trained(InUnits, "b")), dict(trained(lambda env: env, "a")))
@@ -221,7 +213,7 @@ def test_one_hot_actions_are_learned_as_integers_are(pixels):
             **dict.fromkeys(("done", "terminated"), false),
         }
         cfg = PPOConfig(minibatch=3, epochs=2, lr=0.01)
-        PPOLearner(agent, cfg, total_steps=1000).learn(data, 0)
+        PPO(agent, cfg, steps=1000).update(data)
         learned.append(dict(agent.state_dict()))
     assert_equal(*learned)
 
@@ -233,12 +225,12 @@ def test_an_agent_made_for_other_actions_is_refused(step_counter, tmp_path):
         Run.open(tmp_path, {}, recipe="x") as run,
         pytest.raises(UserError, match=r"made for actions .*-1.* environment has .*-2048"),
     ):
-        train_ppo(env, agent, Compose(), config(), steps=BATCH, seed=0, run=run)
+        train_policy(env, PPO(agent, config(), steps=BATCH), Compose(), seed=0, run=run)
 
 
 def test_the_normaliser_learns_after_the_update_has_used_it():
     learner, data = learner_and_batch()
-    learner.learn(data, 0)
+    learner.update(data)
     twin, same = learner_and_batch()
     normalised = twin.agent.normaliser(same["observation"])
     assert torch.equal(data[NORMALISED], normalised)
@@ -248,12 +240,18 @@ def test_the_normaliser_learns_after_the_update_has_used_it():
     assert statistics.count.item() == pytest.approx(120, abs=1)
 
 
+def at(learner, taken):
+    """The learner as it is after ``taken`` environment steps."""
+    learner.load_state_dict({**learner.state_dict(), "steps": taken})
+    return learner
+
+
 def test_step_size_decreases_only_where_asked():
-    for anneal, expected in ((True, [3e-4, 1.5e-4, 0.3e-4]), (False, [3e-4] * 3)):
+    for anneal, expected in ((True, [3e-4, 1.5e-4, 0.375e-4]), (False, [3e-4] * 3)):
         learner, data = learner_and_batch(anneal_lr=anneal)
         found = []
-        for taken in (0, 500, 900):
-            learner.learn(data.clone(), taken)
+        for taken in (0, 512, 896):  # Of 1,024.
+            at(learner, taken).update(data.clone())
             found.append(learner.optimizer.param_groups[0]["lr"])
         assert found == pytest.approx(expected)
 
@@ -262,10 +260,10 @@ def test_a_step_size_of_almost_nothing_changes_almost_nothing():
     def change(taken):
         learner, data = learner_and_batch(anneal_lr=True)
         before = learner.agent.actor[0].weight.clone()
-        learner.learn(data, taken)
+        at(learner, taken).update(data)
         return (learner.agent.actor[0].weight - before).abs().max()
 
-    assert change(0) > 500 * change(999)
+    assert change(0) > 500 * change(1023)
 
 
 @pytest.mark.parametrize("env_id", ["CartPole-v1", "Pendulum-v1"])
@@ -275,7 +273,7 @@ def test_entropy_bonus_keeps_the_policy_random(env_id, tmp_path):
         cfg = config(entropy_coef=coefficient, lr=0.01)
         agent = make_agent(env, cfg, seed=0)
         with Run.open(tmp_path / str(coefficient), {}, recipe="x") as run:
-            train_ppo(env, agent, Compose(), cfg, steps=4 * BATCH, seed=0, run=run)
+            train_policy(env, PPO(agent, cfg, steps=4 * BATCH), Compose(), seed=0, run=run)
         data = env.rollout(20, agent.acting(), break_when_any_done=False)
         return agent.actor_for_loss().get_dist(data).entropy().mean()
 
@@ -293,31 +291,12 @@ def train(
     env = make(env_id)
     agent, transform = make_agent(env, cfg, seed=0), relabel(env)
     with Run.open(folder, {}, recipe="x") as run:
-        trained = train_ppo(env, agent, transform, cfg, steps=steps, seed=seed, run=run)
+        trained = train_policy(env, PPO(agent, cfg, steps=steps), transform, seed=seed, run=run)
         state = run.load("ppo")
     env.close()
     state.pop("seconds")
-    saved = {k: v for k, v in state["parts"].items() if k.startswith("agent.")}
-    assert_equal({f"agent.{k}": v for k, v in agent.state_dict().items()}, saved)
+    assert_equal(dict(agent.state_dict()), state["algorithm"]["agent"])
     return trained, state
-
-
-class Killed(Exception):
-    """Stands for kill -9: nothing is saved after it."""
-
-
-def stop_in_batch(monkeypatch, number, how):
-    """Lets the training be killed or interrupted while it works on its batch ``number``."""
-    log = Run.log
-
-    def log_and_stop(self, step, values, *, phase):
-        log(self, step, values, phase=phase)
-        if step == number * BATCH:
-            if how is Killed:
-                raise Killed
-            signal.raise_signal(signal.SIGINT)
-
-    monkeypatch.setattr(Run, "log", log_and_stop)
 
 
 CASES = {
@@ -340,16 +319,13 @@ CASES = {
 
 
 @pytest.mark.parametrize("case", [*CASES, pytest.param("compiled", marks=pytest.mark.slow)])
-def test_a_run_stopped_again_and_again_ends_bit_for_bit_as_an_undisturbed_one(
-    case, tmp_path, monkeypatch
-):
+def test_a_run_stopped_again_and_again_ends_bit_for_bit_as_an_undisturbed_one(case, tmp_path):
     settings = CASES.get(case, {"compile": True})
     _, expected = train(tmp_path / "whole", **settings)
     # Before the first checkpoint; at an extra checkpoint; between two checkpoints; at the end.
     stops = (1, Killed), (1, Interrupted), (3, Killed), (3, Interrupted), (4, Interrupted)
     for number, how in stops:
-        with monkeypatch.context() as patch, pytest.raises(how):
-            stop_in_batch(patch, number, how)
+        with stopped(how, number * BATCH):
             train(tmp_path / "run", **settings)
         if how is Interrupted:
             saved = load_state(tmp_path / "run" / "ppo.safetensors")
@@ -365,10 +341,11 @@ def test_a_run_stopped_again_and_again_ends_bit_for_bit_as_an_undisturbed_one(
 
 def test_another_seed_or_setting_makes_another_run(tmp_path):
     """Or equality above would mean nothing."""
-    key = "agent.actor.0.weight"
-    first = train(tmp_path / "first")[1]["parts"][key]
-    assert not torch.equal(first, train(tmp_path / "lr", lr=2e-4)[1]["parts"][key])
-    assert not torch.equal(first, train(tmp_path / "seed", seed=1)[1]["parts"][key])
+    found = []
+    for name, change in (("first", {}), ("lr", {"lr": 2e-4}), ("seed", {"seed": 1})):
+        state = train(tmp_path / name, **change)[1]
+        found.append(state["algorithm"]["agent"]["actor.0.weight"])
+    assert not torch.equal(found[0], found[1]) and not torch.equal(found[0], found[2])
 
 
 def test_a_finished_training_is_only_loaded(tmp_path, monkeypatch):
@@ -394,23 +371,6 @@ def test_the_tracker_and_metrics_tell_true_returns(tmp_path):
     assert np.isfinite([value for row in found for value in list(row.values())[1:]]).all()
 
 
-class Garbage(gymnasium.Wrapper):
-    """The environment with another reward."""
-
-    def __init__(self, env, kind):
-        super().__init__(env)
-        self.rng = np.random.default_rng(7)
-        self.kind = kind
-
-    def step(self, action):
-        observation, reward, *rest = self.env.step(action)
-        if self.kind == "noise":
-            reward = 1e3 * self.rng.normal()
-        elif self.kind == "nan":
-            reward = float("nan")
-        return observation, reward, *rest
-
-
 def trained_on(kind, folder, relabel, env_id):
     cfg = config()
 
@@ -420,7 +380,7 @@ def trained_on(kind, folder, relabel, env_id):
     env = GymVectorEnv(make_fn, 4, max_episode_steps=20)
     agent, transform = make_agent(env, cfg, seed=0), relabel(env)
     with Run.open(folder, {}, recipe="x") as run:
-        train_ppo(env, agent, transform, cfg, steps=3 * BATCH, seed=0, run=run)
+        train_policy(env, PPO(agent, cfg, steps=3 * BATCH), transform, seed=0, run=run)
     return dict(agent.state_dict()), dict(transform.state_dict())
 
 
@@ -449,7 +409,7 @@ def test_cartpole_is_learned(tmp_path):
     env = make("CartPole-v1", 8)
     agent = make_agent(env, cfg, seed=0)
     with Run.open(tmp_path, {}, recipe="x") as run:
-        train_ppo(env, agent, Compose(), cfg, steps=15 * 1024, seed=0, run=run)
+        train_policy(env, PPO(agent, cfg, steps=15 * 1024), Compose(), seed=0, run=run)
     returns = [row["train/return_mean"] for row in rows(tmp_path)]
     assert returns[0] < 35
     assert np.mean(returns[-3:]) > 90
@@ -466,8 +426,8 @@ def test_training_stops_at_a_score(tmp_path, step_counter):
         cfg = config(num_envs=2, rollout=32, checkpoint_every=10_000)
         agent = make_agent(env, cfg, seed=0)
         with Run.open(tmp_path / folder, {}, recipe="x") as run:
-            steps = train_ppo(
-                env, agent, Compose(), cfg, steps=4 * 64, seed=0, run=run, stop_at=stop_at
+            steps = train_policy(
+                env, PPO(agent, cfg, steps=4 * 64), Compose(), seed=0, run=run, stop_at=stop_at
             ).steps
             assert run.load("ppo")["steps"] == steps
             return steps, dict(agent.state_dict())

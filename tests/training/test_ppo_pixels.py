@@ -1,9 +1,8 @@
 """PPO on frames: advantages without a second pass, exact resumption, whole games in the log."""
 
-import signal
-
 import pytest
 import torch
+from short_runs import Killed, rows, stopped
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch.utils._pytree import tree_flatten
@@ -12,13 +11,12 @@ from torchrl.objectives.value import GAE
 
 from giril_rl.config.schema import PPOConfig
 from giril_rl.envs import AtariEnv
-from giril_rl.policies.agent import make_agent
-from giril_rl.policies.pixel_policy import PixelActorCritic
+from giril_rl.policies import PixelActorCritic, make_agent
 from giril_rl.rewards import GenerativeReward
 from giril_rl.runs.interrupt import Interrupted
-from giril_rl.runs.metrics import read_metrics
 from giril_rl.runs.run import Run
-from giril_rl.training.ppo import PPOLearner, train_ppo
+from giril_rl.training.loop import train_policy
+from giril_rl.training.ppo import PPO
 from giril_rl.transforms import BatchMeanReward, IntrinsicReward, ReturnScaling
 
 GAMMA, LMBDA = 0.9, 0.8
@@ -91,7 +89,7 @@ def test_advantages_are_those_of_an_ordinary_value_network(agent, termination):
     data = collected(agent)
     expected = {x: ordinary(agent, data, bootstrap=x == "bootstrap") for x in ("ends", "bootstrap")}
     cfg = config(gamma=GAMMA, lmbda=LMBDA, minibatch=18)
-    PPOLearner(agent, cfg, total_steps=1, termination=termination).learn(data, 0)
+    PPO(agent, cfg, steps=1, termination=termination).update(data)
     same = expected[termination]
     torch.testing.assert_close(data["value_target"], same["value_target"], rtol=1e-4, atol=1e-4)
     advantage = same["advantage"]
@@ -128,7 +126,7 @@ def test_the_value_loss_is_clipped_where_asked(agent, clip_value):
         agent.critic.bias.add_(0.7)  # As if earlier minibatches had moved the value.
         value = agent.critic(agent.hidden(data["observation"]))
     cfg = config(clip_value=clip_value, clip=0.1, minibatch=18)
-    losses = PPOLearner(agent, cfg, total_steps=1).learn(data, 0)
+    losses = PPO(agent, cfg, steps=1).update(data)
     target = data["value_target"]
     squared = (value - target) ** 2
     clipped = torch.maximum(squared, (old + 0.1 - target) ** 2)
@@ -148,26 +146,18 @@ def learned_reward(env):
     return Compose(IntrinsicReward(reward), BatchMeanReward(), ReturnScaling(0.99))
 
 
-def rows(folder):
-    """Metrics less what a clock says."""
-    return [
-        {key: value for key, value in row.items() if "seconds" not in key}
-        for row in read_metrics(folder / "metrics.jsonl")
-    ]
-
-
 def train(folder, *, steps=4 * BATCH, env=AtariEnv, relabel=learned_reward, seed=0, **kwargs):
     """Trains in ``folder`` with objects of its own; all that the last checkpoint holds."""
     pytest.importorskip("ale_py")
     env = env("breakout", 2, **kwargs)
     agent, cfg = make_agent(env, config(), seed=0), config()
     with Run.open(folder, {}, recipe="x") as run:
-        train_ppo(env, agent, relabel(env), cfg, steps=steps, seed=seed, run=run)
+        train_policy(env, PPO(agent, cfg, steps=steps), relabel(env), seed=seed, run=run)
         state = run.load("ppo")
     env.close()
     state.pop("seconds")
     for name, value in agent.state_dict().items():
-        assert torch.equal(value, state["parts"][f"agent.{name}"])
+        assert torch.equal(value, state["algorithm"]["agent"][name])
     return state
 
 
@@ -181,33 +171,13 @@ def same(one, other):
 
 
 def policy(state):
-    return {key: value for key, value in state["parts"].items() if key.startswith("agent.")}
+    return state["algorithm"]["agent"]
 
 
-class Killed(Exception):
-    """Stands for kill -9: nothing is saved after it."""
-
-
-def stop_in_batch(monkeypatch, number, how):
-    log = Run.log
-
-    def log_and_stop(self, step, values, *, phase):
-        log(self, step, values, phase=phase)
-        if step == number * BATCH:
-            if how is Killed:
-                raise Killed
-            signal.raise_signal(signal.SIGINT)
-
-    monkeypatch.setattr(Run, "log", log_and_stop)
-
-
-def test_a_run_stopped_again_and_again_ends_bit_for_bit_as_an_undisturbed_one(
-    tmp_path, monkeypatch
-):
+def test_a_run_stopped_again_and_again_ends_bit_for_bit_as_an_undisturbed_one(tmp_path):
     expected = train(tmp_path / "whole")
     for number, how in ((1, Interrupted), (3, Killed)):
-        with monkeypatch.context() as patch, pytest.raises(how):
-            stop_in_batch(patch, number, how)
+        with stopped(how, number * BATCH):
             train(tmp_path / "run")
         torch.manual_seed(1234 + number)  # As in a new process.
     assert same(train(tmp_path / "run"), expected)

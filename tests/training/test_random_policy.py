@@ -8,7 +8,7 @@ from torchrl.data import Bounded, Categorical, MultiCategorical, OneHot, Unbound
 from giril_rl.config.schema import TaskConfig
 from giril_rl.errors import UserError
 from giril_rl.training import HeldAction, RandomPolicy
-from giril_rl.training.evaluate import evaluate
+from giril_rl.training.scoring import evaluate
 
 CARTPOLE = TaskConfig(name="cartpole", env_id="CartPole-v1")
 

@@ -10,13 +10,13 @@ from torchrl.data import Bounded, Categorical
 from torchrl.envs import Compose
 from torchrl.objectives.value import GAE
 
-from giril_rl.config.schema import PPOConfig
-from giril_rl.graphs.recorded import record
-from giril_rl.graphs.traced import TracedGradients
-from giril_rl.policies.pixel_policy import PixelActorCritic
-from giril_rl.policies.policy import ActorCritic
+from giril_rl.config.schema import AdversarialConfig, PPOConfig
+from giril_rl.graphs import recording
+from giril_rl.graphs.gradients import TracedGradients
+from giril_rl.graphs.recording import record
+from giril_rl.policies.actor_critic import ActorCritic
+from giril_rl.policies.pixel_actor_critic import PixelActorCritic
 from giril_rl.rewards import (
-    AdversarialConfig,
     AffineReward,
     BottleneckLoss,
     BottleneckReward,
@@ -34,8 +34,8 @@ from giril_rl.rewards import (
 )
 from giril_rl.rewards.actions import ActionEncoder
 from giril_rl.rewards.fitting import fit
-from giril_rl.training import AdversarialLearner, recorded
-from giril_rl.training.ppo import PPOLearner
+from giril_rl.training import AdversarialTrainer
+from giril_rl.training.ppo import PPO
 from giril_rl.transforms import BatchMeanReward, IntrinsicReward, ReturnScaling
 
 ENVS, TIME = 2, 8
@@ -82,7 +82,7 @@ class Eager(TracedGradients):
 
     def __init__(self, *args, **kwargs):
         super().__init__(*args, **kwargs)
-        self._recorded = False
+        self._graph._recorded = False
 
 
 def test_devices_do_not_mix():
@@ -127,7 +127,7 @@ def test_training_a_discriminator(cls, loss, penalty, kind):
     module = loss(made(cls, kind), penalty=penalty)
     keys = ["observation", "action"]
     expert, policy = transitions(kind, 20).select(*keys), transitions(kind, 4, 8).select(*keys)
-    learner = AdversarialLearner(module, expert, AdversarialConfig(batch=8, updates=2), seed=0)
+    learner = AdversarialTrainer(module, expert, AdversarialConfig(batch=8, updates=2), seed=0)
     with second_device(values=True) as device:
         device.take(module)
         learner.gradients = Eager(module, keys=module.in_keys, log=module.log_keys)
@@ -140,7 +140,7 @@ def test_training_a_discriminator(cls, loss, penalty, kind):
 
 def test_a_step_of_ppo(kind):
     agent = agent_for(kind)
-    learner = PPOLearner(agent, PPOConfig(clip_value=True, entropy_coef=0.01), total_steps=8)
+    learner = PPO(agent, PPOConfig(clip_value=True, entropy_coef=0.01), steps=8)
     rows = {agent.drawn_key: transitions(kind, 8)["action"], agent.input_keys[0]: torch.randn(8, 3)}
     if kind == "pixels":
         rows[agent.input_keys[0]] = agent.actor.deal(observations(kind, 8))
@@ -166,7 +166,7 @@ def test_acting_relabelling_and_learning(kind, termination, monkeypatch):
     reward = made(GenerativeReward, kind).eval()
     relabel = Compose(IntrinsicReward(reward), BatchMeanReward(), ReturnScaling())
     cfg = PPOConfig(num_envs=ENVS, rollout=TIME, minibatch=8, epochs=2, clip_value=True)
-    learner = PPOLearner(agent, cfg, total_steps=ENVS * TIME, termination=termination)
+    learner = PPO(agent, cfg, steps=ENVS * TIME, termination=termination)
     batch = TensorDict({"observation": observations(kind, ENVS, TIME)}, [ENVS, TIME])
     ended = torch.zeros(ENVS, TIME, 1, dtype=torch.bool)
     following = observations(kind, ENVS, TIME)
@@ -187,7 +187,7 @@ def test_acting_relabelling_and_learning(kind, termination, monkeypatch):
         relabel(collected)
         moved = relabel(collected)  # What was kept from the first batch is not looked at.
         assert moved["next", "reward"].device == DEVICE
-        assert "loss_critic" in learner.learn(moved, 0)
+        assert "loss_critic" in learner.update(moved)
 
 
 @pytest.mark.parametrize("reward", ["weights", "buffers", "neither"])
@@ -216,7 +216,7 @@ def test_all_of_vails_loss_goes_where_its_reward_is(kind):
     reward = made(BottleneckReward, kind).to(DEVICE)
     loss = BottleneckLoss(reward)
     expert = transitions(kind, 20).select("observation", "action")
-    AdversarialLearner(loss, expert, AdversarialConfig(), seed=0)
+    AdversarialTrainer(loss, expert, AdversarialConfig(), seed=0)
     assert loss.beta.device == DEVICE
 
 
@@ -237,7 +237,7 @@ def test_a_demonstration_is_taken_to_the_loss_it_is_fitted_by(monkeypatch):
 def test_a_graph_for_another_device_is_not_compiled(monkeypatch):
     # There are no values there to compare the graph's with.
     monkeypatch.setattr(torch, "equal", lambda *_: True)
-    monkeypatch.setattr(recorded, "_same", lambda *_: True)
+    monkeypatch.setattr(recording, "_equal", lambda *_: True)
     on_cpu, elsewhere = (
         record(lambda x: (x + x,), [torch.ones(2, device=device)]) for device in ("cpu", DEVICE)
     )

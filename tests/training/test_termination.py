@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from short_runs import Killed, rows
 from tensordict import TensorDict
 from torch import nn
 from torchrl.data import Bounded
@@ -11,12 +12,12 @@ from giril_rl.config.recipe_files import shipped
 from giril_rl.config.schema import PPOConfig, TaskConfig
 from giril_rl.envs import make_env
 from giril_rl.errors import UserError
-from giril_rl.policies.agent import make_agent
-from giril_rl.policies.policy import ActorCritic
-from giril_rl.runs.metrics import read_metrics
+from giril_rl.policies.actor_critic import ActorCritic
+from giril_rl.policies.making import make_agent
 from giril_rl.runs.run import Run
-from giril_rl.training.evaluate import evaluate
-from giril_rl.training.ppo import PPOLearner, train_ppo
+from giril_rl.training.loop import train_policy
+from giril_rl.training.ppo import PPO
+from giril_rl.training.scoring import evaluate
 from giril_rl.transforms import ReturnScaling
 
 
@@ -41,7 +42,7 @@ def targets(termination, **kwargs):
     """Values and advantages added up; gamma and lambda are 1/2, so gamma * lambda is 1/4."""
     agent, data = two_steps(**kwargs)
     cfg = PPOConfig(gamma=0.5, lmbda=0.5, minibatch=2, epochs=1)
-    PPOLearner(agent, cfg, total_steps=1, termination=termination).learn(data, 0)
+    PPO(agent, cfg, steps=1, termination=termination).update(data)
     return data["value_target"].flatten().tolist()
 
 
@@ -76,14 +77,14 @@ def test_a_hidden_reset_is_worth_what_it_leads_to():
 def test_the_batch_keeps_its_flags():
     agent, data = two_steps(failed=True, done=True)
     cfg = PPOConfig(minibatch=2, epochs=1)
-    PPOLearner(agent, cfg, total_steps=1, termination="bootstrap").learn(data, 0)
+    PPO(agent, cfg, steps=1, termination="bootstrap").update(data)
     assert data["next", "terminated"].flatten().tolist() == [True, False]
 
 
 def test_other_words_are_refused():
     agent, _ = two_steps(failed=True, done=True)
     with pytest.raises(UserError, match=r"^termination=never: choose one of ends, bootstrap\.$"):
-        PPOLearner(agent, PPOConfig(), total_steps=1, termination="never")
+        PPO(agent, PPOConfig(), steps=1, termination="never")
 
 
 # Whole trainings
@@ -115,25 +116,15 @@ def train(folder, **task):
 
     relabel = Compose(ReturnScaling(0.99))
     with Run.open(folder, {}, recipe="x") as run:
-        train_ppo(
+        train_policy(
             env,
-            agent,
+            PPO(agent, cfg, steps=4 * BATCH, termination=termination),
             nn.Sequential(Constant(), relabel),
-            cfg,
-            steps=4 * BATCH,
             seed=0,
             run=run,
-            termination=termination,
         )
     env.close()
-    rows = read_metrics(folder / "metrics.jsonl")
-    return dict(agent.state_dict()), [
-        {k: v for k, v in row.items() if "seconds" not in k} for row in rows
-    ]
-
-
-class Killed(Exception):
-    """Stands for kill -9: nothing is saved after it."""
+    return dict(agent.state_dict()), rows(folder)
 
 
 CASES = {
@@ -180,4 +171,4 @@ def test_a_score_is_of_the_tasks_own_episodes():
 @pytest.mark.parametrize("recipe", shipped(), ids=lambda recipe: recipe.name)
 def test_every_recipe_that_trains_a_policy_passes_the_choice_on(recipe):
     text = recipe.path.read_text()
-    assert text.count("termination=cfg.termination") == text.count("= train_ppo(")
+    assert text.count("termination=cfg.termination") == text.count("ppo = PPO(")

@@ -1,7 +1,6 @@
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import Compose, SerialEnv, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
@@ -49,12 +48,6 @@ def test_serial_env(counter_env, policy):
     torch.testing.assert_close(data["next", "reward"], true.expand(2, 3, 9, 1))
     with pytest.raises(UserError, match="outside"):
         SerialEnv(2, lambda: TransformedEnv(counter_env(1), BatchMeanReward())).reset()
-
-
-def test_replay_buffer_leaves_single_transitions_alone():
-    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(8), transform=BatchMeanReward())
-    buffer.extend(TensorDict({"next": {"reward": torch.arange(8.0).unsqueeze(-1)}}, [8]))
-    assert buffer.sample(64)["next", "reward"].unique().numel() > 1
 
 
 def test_values_do_not_share_memory():

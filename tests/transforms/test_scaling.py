@@ -3,7 +3,6 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torchrl.collectors import Collector
-from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.envs import Compose, SerialEnv, Transform, TransformedEnv
 from torchrl.envs.utils import check_env_specs
 
@@ -121,14 +120,6 @@ def test_whole_stack_env_equals_batch(counter_env, policy, reset):
     assert env.reward_key == "reward"
 
 
-@pytest.mark.parametrize("group", [None, "agent"])
-@pytest.mark.parametrize("clip", [10.0, None])
-def test_specs(counter_env, group, clip):
-    key = "reward" if group is None else (group, "reward")
-    env = TransformedEnv(counter_env(group=group), ReturnScaling(reward_key=key, clip=clip))
-    check_env_specs(env)
-
-
 def test_manual_reset_of_some_environments(counter_env, policy):
     for reset, expected in (("done", [1.99, 0.0, 1.99]), ("never", [1.99] * 3)):
         scaling = ReturnScaling(0.99, reset=reset)
@@ -178,18 +169,6 @@ def test_frozen_before_anything_was_learned_is_refused():
     stack.append(ReturnScaling())
     with pytest.raises(UserError, match="learned nothing"):
         stack(make_batch(torch.randn(2, 5, 1)))
-
-
-def test_eval_in_a_replay_buffer():
-    scaling = ReturnScaling(0.9)
-    scaling(make_batch(torch.randn(4, 50, 1)))
-    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(40), transform=scaling.eval())
-    reward = torch.arange(40.0).unsqueeze(-1) / 40
-    buffer.extend(TensorDict({"index_": torch.arange(40), "next": {"reward": reward}}, [40]))
-    sample = buffer.sample(30)
-    deviation = (scaling.m2 / scaling.count + 1e-8).sqrt().float()
-    expected = reward[sample["index_"]] / deviation
-    torch.testing.assert_close(sample["next", "reward"], expected)
 
 
 def test_state_round_trip_into_a_fresh_instance():

@@ -2,7 +2,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
-from torchrl.envs import Compose, SerialEnv, TransformedEnv
+from torchrl.envs import Compose, TransformedEnv
 from torchrl.envs.transforms import Transform
 from torchrl.envs.utils import check_env_specs
 
@@ -96,12 +96,6 @@ def test_an_environment_of_several_rewards_is_left_with_one(counter_env, policy)
     env = TransformedEnv(counter_env(), Compose(Second(), fresh))
     check_env_specs(env)
     assert env.reward_keys == ["total"]
-
-
-def test_inside_workers(counter_env, policy):
-    env = SerialEnv(2, lambda: TransformedEnv(counter_env(1), stack()))
-    check_env_specs(env)
-    assert rollout(env, policy())["next", "reward"].shape == (2, 1, 9, 1)
 
 
 def test_weight_zero_is_not_read_and_weights_may_change():

@@ -7,8 +7,8 @@ import torch
 import yaml
 
 from giril_rl.demos import Demonstration
-from giril_rl.files.checkpoint import load_state
 from giril_rl.files.disk import read_json
+from giril_rl.runs.checkpoint import load_state
 from giril_rl.runs.metrics import read_metrics
 
 CLOCK = {"wall_seconds", "fit_seconds", "steps_per_second", "finished_at", "seconds"}

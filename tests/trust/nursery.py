@@ -73,7 +73,7 @@ def serve():
     import giril_rl.cli.study
     import giril_rl.runs.curve
     import giril_rl.training  # noqa: F401
-    from giril_rl.envs.stdout import silent_stdout
+    from giril_rl.envs.gym_api import silent_stdout
 
     with silent_stdout(stderr=True):
         import pybullet_envs_gymnasium  # noqa: F401

@@ -19,9 +19,9 @@ from giril_rl.config.schema import BCConfig, FitConfig, PPOConfig, TaskConfig
 from giril_rl.demos import record_demonstration
 from giril_rl.envs import GymVectorEnv, gym_factory, make_env
 from giril_rl.errors import FAILED, RunError
-from giril_rl.files.checkpoint import load_state
 from giril_rl.rewards import GenerativeReward, GenerativeRewardLoss
-from giril_rl.training import Run, clone_behaviour, fit_reward, make_agent, train_ppo
+from giril_rl.runs.checkpoint import load_state
+from giril_rl.training import PPO, Run, clone_behaviour, fit_reward, make_agent, train_policy
 from giril_rl.transforms import ReturnScaling
 
 TASK = TaskConfig(name="cartpole", env_id="CartPole-v1")
@@ -86,7 +86,7 @@ def trained(folder, relabel, **changes):
     env = make_env(TASK, cfg.num_envs, 0)
     agent = make_agent(env, cfg, 0)
     with Run.open(folder, {}, recipe="x") as run:
-        train_ppo(env, agent, relabel, cfg, steps=64 * 4, seed=0, run=run)
+        train_policy(env, PPO(agent, cfg, steps=64 * 4), relabel, seed=0, run=run)
 
 
 class Breaks(nn.Module):
@@ -116,7 +116,7 @@ def test_a_reward_that_is_no_number(value, scaled, tmp_path):
         trained(tmp_path, relabel(value))
     saved = load_state(tmp_path / "ppo.safetensors")
     assert saved["steps"] == 128
-    weights = [v for v in saved["parts"].values() if v.is_floating_point()]
+    weights = [v for v in saved["algorithm"]["agent"].values() if v.is_floating_point()]
     assert weights and all(v.isfinite().all() for v in weights)
     # The same folder goes on from there once its reward is sound.
     trained(tmp_path, relabel(1.0))
@@ -147,7 +147,7 @@ def test_an_observation_that_is_no_number_is_named(value, tmp_path):
         Run.open(tmp_path, {}, recipe="x") as run,
         pytest.raises(RunError, match=rf"observation is {value} at \[0, \d+, 2\] of the batch at"),
     ):
-        train_ppo(env, agent, Breaks(1.0), SMALL, steps=64 * 4, seed=0, run=run)
+        train_policy(env, PPO(agent, SMALL, steps=64 * 4), Breaks(1.0), seed=0, run=run)
     assert env.is_closed
     assert agent.normaliser.mean.isfinite().all()
 
@@ -161,17 +161,17 @@ def test_an_observation_that_is_no_number_is_named(value, tmp_path):
 )
 def test_what_is_no_number_is_not_saved(broken, sentence, tmp_path, monkeypatch):
     """The end of an update may break what all losses were computed with before."""
-    from giril_rl.training.ppo import PPOLearner
+    from giril_rl.training.ppo import PPO
 
-    learn = PPOLearner.learn
+    learn = PPO.update
 
-    def learn_and_break(self, batch, taken):
-        losses = learn(self, batch, taken)
-        if taken == 128:
+    def learn_and_break(self, batch):
+        losses = learn(self, batch)
+        if self.state_dict()["steps"] == 192:
             self.agent.state_dict()[broken].view(-1)[0] = float("nan")
         return losses
 
-    monkeypatch.setattr(PPOLearner, "learn", learn_and_break)
+    monkeypatch.setattr(PPO, "update", learn_and_break)
     with pytest.raises(RunError, match=sentence):
         trained(tmp_path, Breaks(1.0))
     assert load_state(tmp_path / "ppo.safetensors")["steps"] == 128

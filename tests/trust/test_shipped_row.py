@@ -8,7 +8,8 @@ import pytest
 from safetensors.torch import load_file
 
 from giril_rl.cli.command_line import main
-from giril_rl.files.disk import installed_versions, processor, read_json
+from giril_rl.files.disk import read_json
+from giril_rl.runs.machine import installed_versions, processor
 from giril_rl.runs.metrics import read_metrics
 
 KEPT = read_json(Path(__file__).resolve().parents[1] / "data" / "short_row.json")

@@ -63,8 +63,9 @@ def spoilt_demonstration(change):
 
 def run_folder(change=lambda folder: None, finished=True):
     """The kept run as if made here, changed."""
-    from giril_rl.files.disk import installed_versions, write_json
-    from giril_rl.files.formats import RUN_FORMAT
+    from giril_rl.files.disk import write_json
+    from giril_rl.runs.finished import RUN_FORMAT
+    from giril_rl.runs.machine import installed_versions
 
     def ready(folder):
         (folder / ".lock").touch()

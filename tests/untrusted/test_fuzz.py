@@ -17,8 +17,8 @@ from giril_rl.config.recipe_config import config_class
 from giril_rl.config.recipe_files import find
 from giril_rl.errors import UserError
 from giril_rl.experiments.study.spec import read_spec
-from giril_rl.files.checkpoint import load_state
 from giril_rl.files.untrusted import parse_json, parse_yaml
+from giril_rl.runs.checkpoint import load_state
 
 GIRIL = find("giril")
 CONFIG = config_class(GIRIL)

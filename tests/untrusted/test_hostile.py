@@ -19,13 +19,12 @@ from files import (
     spoilt_demonstration,
     text,
     tree,
-    words,
     written,
 )
 
 from giril_rl.cli.command_line import main
 from giril_rl.errors import UserError
-from giril_rl.files.checkpoint import load_state, save_state
+from giril_rl.runs.checkpoint import load_state, save_state
 
 CALL = '!!python/object/apply:os.system ["touch mark"]'
 BOMB = "\n".join(
@@ -128,7 +127,7 @@ def played(**changes):
 CASES = {
     "hang: an action that the game does not have": (
         lambda: played(actions=99),
-        "game/ppo.safetensors cannot be put back (ValueError: its actions are not between 0 and 3",
+        "game/ppo.safetensors cannot be restored (ValueError: its actions are not between 0 and 3",
     ),
     "pickle: a checkpoint": (lambda: resumed(pickled("ppo.safetensors")), "is damaged"),
     "pickle: a policy": (
@@ -295,6 +294,11 @@ REWARDS = {
     "a class that is a list": (card(**{"class": ["x"]}), "not of a GenerativeReward"),
     "another method": (card(constructor="load_state_dict"), "has no constructor"),
     "an object's method": (card(constructor="__reduce__"), "has no constructor"),
+    "a constructor without a record": (card(constructor="__init__"), "no constructor '__init__'"),
+    "a constructor that is a list": (card(constructor=["for_vectors"]), "has no constructor"),
+    "text for a constructor": (entries("reward/card.json", made_by="os.system"), "is of a None"),
+    "no arguments": (card(arguments=None), "cannot be made"),
+    "an argument missing": (card(arguments={"observation_dim": 3}), "cannot be made"),
     "a huge network": (argument(hidden=[10**6, 10**6, 10**6]), "does not fit its card"),
     "more than there is": (argument(hidden=[2**62, 2**62]), "cannot be made"),
     "many layers": (argument(hidden=[1] * 20_000), "cannot be made (a list of 20,000 entries)"),
@@ -358,7 +362,3 @@ def test_the_canaries_sing(here):
         assert Path("mark").exists()
         Path("mark").unlink()
     del sys.modules["evil_module"]
-
-
-def test_words_are_those_of_the_kept_run():
-    assert words("out=x")[-1] == "out=x" and "out=run" not in words("out=x")

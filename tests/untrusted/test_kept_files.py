@@ -12,11 +12,11 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from giril_rl.cli.command_line import main
 from giril_rl.demos import Demonstration
 from giril_rl.errors import UserError
-from giril_rl.files.checkpoint import load_state
 from giril_rl.files.disk import read_json, write_json
-from giril_rl.files.formats import check_format
-from giril_rl.policies.agents import load_agent_from
+from giril_rl.files.untrusted import check_format
+from giril_rl.policies import load_agent_from
 from giril_rl.rewards import GenerativeReward
+from giril_rl.runs.checkpoint import load_state
 
 LOGITS = [0.6002023, -0.7985780, 0.0336854, -0.2988219]
 PAID = [15336.5977, 15327.0957]

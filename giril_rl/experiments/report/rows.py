@@ -1,48 +1,51 @@
-"""Runs that differ in their seed alone, as one row of a table."""
+"""Groups runs that differ in the seed alone into rows, and the rows of a task into a panel."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
-from giril_rl.experiments.report.ablations import ABLATION_KEYS
-from giril_rl.experiments.report.normalised import Scale, by_seed
-from giril_rl.experiments.report.paper import paper_figure
-from giril_rl.experiments.report.runs import RunRecord
+from giril_rl.experiments.report.entries import (
+    OWN,
+    PLAYER,
+    TRUE_REWARD,
+    entry,
+    is_own,
+    order,
+)
+from giril_rl.experiments.report.reading import RunRecord
 from giril_rl.experiments.report.settings import (
     Changes,
     changes_of,
-    method_of,
     profile_of,
     shared_changes,
     split_task,
 )
 from giril_rl.experiments.report.statistics import Estimate, mean_and_iqm
-from giril_rl.experiments.report.style import (
-    CONTROL,
-    TRUE_REWARD,
-    Look,
-    is_own,
-    look,
-    method_name,
-    rank,
-)
-from giril_rl.training.random_policy import RANDOM
+from giril_rl.rewards.method import Method
+from giril_rl.training.baselines import RANDOM
 
 
-@dataclass
+class Look(NamedTuple):
+    """How a line is drawn."""
+
+    color: str
+    linestyle: str
+
+
+@dataclass(eq=False)
 class Row:
     """One method with one setting and budget on one task.
 
     Attributes:
-        method: as :func:`giril_rl.experiments.report.settings.method_of` names it.
+        method: see :attr:`giril_rl.experiments.report.reading.RunRecord.method`.
         profile: None where it makes no difference.
-        changes: settings that differ from the recipe's own, less those of the whole panel.
-        steps: the budget that the runs were given.
+        changes: settings that differ from the recipe's own, without those that the panel shares.
+        steps: the budget of environment steps.
         runs: its runs, by seed.
-        number: of a recipe of the user's own, its place among all of them in the report.
+        number: the place of your own recipe among all of them in the report.
     """
 
     method: str
@@ -53,34 +56,41 @@ class Row:
     number: int = 0
 
     @property
+    def about(self) -> Method:
+        """Its method's entry."""
+        return entry(self.method, self.number)
+
+    @property
     def name(self) -> str:
-        """The method as tables name it."""
-        return method_name(self.method, self.profile)
+        """The method as tables name it.
+
+        Examples:
+            >>> Row("giril", "paper", (), 10).name, Row("control:copy", "released", (), 10).name
+            ('GIRIL (paper)', 'control: copy')
+        """
+        shown = self.profile and not (self.is_control and self.profile == "released")
+        return f"{self.about.label} ({self.profile})" if shown else self.about.label
 
     @property
     def is_control(self) -> bool:
-        """Whether nothing of the row was learned from a demonstration's actions."""
-        return self.method.startswith(CONTROL)
+        """Whether its method is a control."""
+        return self.about.kind == "control"
 
     @property
     def is_learned(self) -> bool:
-        """Whether it is of a method that imitates: no control, and nothing on the true reward."""
-        return not self.is_control and self.method not in ("expert", TRUE_REWARD)
+        """Whether its method imitates: neither a control nor a policy trained on true rewards."""
+        return not self.is_control and self.method not in (PLAYER, TRUE_REWARD)
 
     @property
     def look(self) -> Look:
-        """How it is drawn."""
-        return look(self.method, self.profile, self.number)
+        """How it is drawn: the profile "paper" and the seventh recipe of your own are dashed."""
+        turn = 2 * (self.number // len(OWN)) + (self.profile == "paper")
+        return Look(self.about.colour, ("-", "--", "-.", ":")[turn % 4])
 
     @property
     def settings(self) -> str:
         """The changes as overrides, empty where there are none."""
         return " ".join(f"{key}={value}" for key, value in self.changes)
-
-    @property
-    def results(self) -> list[dict[str, Any]]:
-        """The runs' results."""
-        return [run.result for run in self.runs if run.result is not None]
 
     @property
     def seeds(self) -> list[int]:
@@ -90,93 +100,72 @@ class Row:
     @property
     def scores(self) -> list[float]:
         """Each run's mean return, of the policy as trained."""
-        return [float(result["return_mean"]) for result in self.results]
+        return [run.score for run in self.runs]
 
     @property
     def modes(self) -> list[float]:
-        """Each run's mean return when the policy plays its mode; empty where a run has none."""
-        found = [result.get("deterministic") for result in self.results]
+        """Each run's mean return with the policy's most likely actions; empty if a run has none."""
+        found = [run.result.get("deterministic") for run in self.runs]
         return [float(mode["return_mean"]) for mode in found if mode] if all(found) else []
 
     @property
-    def mode_mean(self) -> float | None:
-        """Mean of :attr:`modes`, None where there are none."""
-        return _mean(self.modes)
-
-    @property
     def trained_steps(self) -> list[int]:
-        """Environment steps that the runs took: fewer than the budget for an early stop or BC."""
-        return sorted({int(result["env_steps"]) for result in self.results})
-
-    @property
-    def life_length(self) -> float | None:
-        """Mean over runs of the steps that a life lasts; None for tasks without lives."""
-        return _mean([result.get("life_length_mean") for result in self.results])
-
-    @property
-    def speed(self) -> float | None:
-        """Mean over runs of the environment steps a second that training took."""
-        if not self.is_trained:
-            return None
-        return _mean([result.get("steps_per_second") for result in self.results])
+        """Environment steps that runs took: fewer than the budget if one stopped early."""
+        return sorted({int(run.result["env_steps"]) for run in self.runs})
 
     @property
     def is_trained(self) -> bool:
-        """Whether it took steps in the environment: cloning and a random policy do not."""
+        """Whether it took environment steps, unlike cloning or a random policy."""
         return any(self.trained_steps)
+
+    def mean_of(self, key: str) -> float | None:
+        """Mean over runs of an entry of their results; None if a run lacks it."""
+        return mean([run.result.get(key) for run in self.runs])
 
     @cached_property
     def estimates(self) -> tuple[Estimate, Estimate]:
-        """Mean and interquartile mean over seeds."""
+        """Mean and interquartile mean of the scores."""
         return mean_and_iqm(self.scores)
 
     @property
     def order(self) -> tuple[Any, ...]:
-        """Where the row stands in a table."""
-        # `released` is the default and comes first.
+        """Sorts the rows of a table."""
         changes = [(key, _numeric(value)) for key, value in self.changes]
-        return (*rank(self.method), self.profile != "released", self.steps, changes)
+        return (*order(self.method), self.profile != "released", self.steps, changes)
 
 
-def _mean(values: Sequence[float | None]) -> float | None:
-    """None where a value is missing."""
+def mean(values: Sequence[float | None]) -> float | None:
+    """The mean; None if there is no value or one is missing.
+
+    Examples:
+        >>> mean([1.0, 2.0]), mean([1.0, None]), mean([])
+        (1.5, None, None)
+    """
     found = [value for value in values if value is not None]
     return sum(found) / len(found) if found and len(found) == len(values) else None
 
 
 def _numeric(text: str) -> tuple[float, str]:
-    """Sorts numbers by their size and before words."""
+    """Sorts numbers by size, and before words."""
     try:
         return float(text), ""
     except ValueError:
         return float("inf"), text
 
 
-def longest(rows: Iterable[Row]) -> list[Row]:
-    """Of each method but the expert, the row with the largest budget.
-
-    Examples:
-        >>> [row.steps for row in longest([Row("bc", None, (), 10), Row("bc", None, (), 20)])]
-        [20]
-    """
-    found: dict[tuple[str, str | None], Row] = {}
-    for row in rows:
-        key = row.method, row.profile
-        if row.method != "expert" and (key not in found or row.steps > found[key].steps):
-            found[key] = row
-    return list(found.values())
-
-
-@dataclass
+@dataclass(eq=False)
 class Panel:
     """All rows of one task.
 
+    Scores are normalised between those of a random policy, 0, and of the player that made the
+    demonstration, 1. The scale is linear, so that scores may be negative or above 1.
+
     Attributes:
         task: the task's name.
-        changes: what makes the task another one, such as a fixed horizon.
+        changes: settings that make the task another one, such as a fixed horizon.
         shared: further changes that all of its runs have.
         rows: the rows in order.
-        repeats: runs that repeat a row's seed and count nowhere.
+        repeats: runs that repeat a row's seed and do not count.
     """
 
     task: str
@@ -187,7 +176,7 @@ class Panel:
 
     @property
     def title(self) -> str:
-        """The task, with what makes it another one.
+        """The task with its changes.
 
         Examples:
             >>> Panel("t", (("task.horizon", "fixed"),), (), [], []).title
@@ -201,70 +190,100 @@ class Panel:
         return [row for row in self.rows if not row.changes]
 
     @property
-    def demonstration(self) -> str:
-        """What the demonstration is called: one life's score is not to be read as a game's."""
-        runs = [run for row in self.rows for run in row.runs]
-        lives = {run.config["demo.lives"] for run in runs if "demo.lives" in run.config}
-        atari = any(run.is_atari for run in runs)
-        return "demonstration of one life" if atari and lives == {"first"} else "demonstration"
+    def runs(self) -> list[RunRecord]:
+        """The runs of all rows."""
+        return [run for row in self.rows for run in row.runs]
 
-    @cached_property
-    def scale(self) -> Scale:
-        """What scores are normalised by."""
-        random = [score for row in self.rows if row.method == RANDOM for score in row.scores]
-        every = [run for row in self.rows for run in row.runs]
-        players = by_seed(every, "expert_return_mean") | self._main_by_seed("expert")
-        return Scale(_mean(random), players)
+    @property
+    def demonstration(self) -> str:
+        """What to call the demonstration: the score of one life is not that of a whole game."""
+        lives = {run.config["demo.lives"] for run in self.runs if "demo.lives" in run.config}
+        counted = any(run.family.has_lives for run in self.runs)
+        return "demonstration of one life" if counted and lives == {"first"} else "demonstration"
 
     def references(self, who: str) -> list[float]:
         """Mean return of each seed's ``expert`` or ``demo``, of the main rows if they have any.
 
-        One value where all seeds have the same.
+        One value if it is the same for all seeds.
         """
-        found = list(self._main_by_seed(who).values())
-        if not found:
-            every = [run for row in self.rows for run in row.runs]
-            found = list(by_seed(every, f"{who}_return_mean").values())
+        key = f"{who}_return_mean"
+        found = list((self._main_by_seed(key) or by_seed(self.runs, key)).values())
         return found[:1] if len(set(found)) == 1 else found
 
-    def _main_by_seed(self, who: str) -> dict[int, float]:
-        return by_seed([run for row in self.main for run in row.runs], f"{who}_return_mean")
+    def _main_by_seed(self, key: str) -> dict[int, float]:
+        return by_seed([run for row in self.main for run in row.runs], key)
 
-    def reference(self, who: str) -> float | None:
-        """Mean over seeds of :meth:`references`; None where there are none."""
-        return _mean(self.references(who))
+    @cached_property
+    def random(self) -> float | None:
+        """Mean score of the random policy; None if there is no run of it."""
+        return mean([score for row in self.rows if row.method == RANDOM for score in row.scores])
+
+    @cached_property
+    def _players(self) -> dict[int, float]:
+        key = "expert_return_mean"
+        return by_seed(self.runs, key) | self._main_by_seed(key)
+
+    def player(self, run: RunRecord) -> float | None:
+        """Score of a run's player; that of its seed if the run has no demonstration."""
+        if run.result.get("expert_return_mean") is not None:
+            return float(run.result["expert_return_mean"])
+        return None if run.has_demonstration else self._players.get(run.seed)
+
+    def normalised_run(self, run: RunRecord) -> float | None:
+        """A run's normalised score.
+
+        None for the player itself, without a player or a random policy, and if the player does not
+        score above the random policy.
+        """
+        low, high = self.random, self.player(run)
+        if run.method == PLAYER or low is None or high is None or high <= low:
+            return None
+        return (run.score - low) / (high - low)
 
     def normalised(self, row: Row) -> list[float]:
-        """A row's scores between a random policy's and each run's player's; empty without them."""
-        return self.scale.of_runs(row.runs)
+        """The normalised scores of a row's runs; empty if one of them has none."""
+        found = [self.normalised_run(run) for run in row.runs]
+        scores = [score for score in found if score is not None]
+        return scores if len(scores) == len(found) else []
 
     def best_control(self, row: Row) -> Row | None:
         """The control with the highest mean at a row's budget, with its recipe's own settings.
 
-        A row that took no environment steps is compared with the controls of the largest budget.
-        None where no control was trained at that budget: to be better than a random policy says
-        nothing.
+        A row that took no environment steps is compared at the controls' largest budget. None if no
+        control was trained at that budget: a random policy alone is no comparison.
         """
         controls = [other for other in self.main if other.is_control]
         most = max((other.steps for other in controls), default=0)
         steps = row.steps if row.is_trained else most
         fair = [other for other in controls if other.steps == steps and other.is_trained]
         fair += [other for other in controls if fair and not other.is_trained]
+        fair.sort(key=lambda other: (not other.is_trained, other.method))  # Decides ties.
         return max(fair, key=lambda other: other.estimates[0].value, default=None)
 
 
-def panels_of(runs: Sequence[RunRecord]) -> list[Panel]:
-    """Groups finished runs into rows, and rows into panels by their task."""
-    changes = changes_of(runs)
-    own = sorted({method for run in runs if is_own(method := method_of(run))})
-    tasks: dict[tuple[str, Changes], list[RunRecord]] = {}
+def by_seed(runs: Iterable[RunRecord], key: str) -> dict[int, float]:
+    """For each seed, the value of ``key`` that most results have."""
+    found: dict[int, list[float]] = {}
     for run in runs:
-        # An expert is trained on the task's own horizon, and belongs to it.
-        key = (str(run.config["task.name"]), split_task(changes[run.name])[0])
-        tasks.setdefault(key, []).append(run)
-    # The paper's tasks come first.
-    order = sorted(tasks, key=lambda key: (not paper_figure("results", key[0], "giril"), *key))
-    return [_panel(*key, tasks[key], changes, own) for key in order]
+        if run.result.get(key) is not None:
+            found.setdefault(run.seed, []).append(float(run.result[key]))
+    return {seed: max(each, key=each.count) for seed, each in sorted(found.items())}
+
+
+def group(runs: Sequence[RunRecord], keep: frozenset[str]) -> list[Panel]:
+    """Groups runs into rows and panels; the settings in ``keep`` make rows even if all agree."""
+    changes = changes_of(runs)
+    own = sorted({run.method for run in runs if is_own(run.method)})
+    tasks: dict[tuple[str, Changes], list[RunRecord]] = {}
+    # Cloning and experts know no `termination`: they join the runs that do, whatever its value.
+    for run in sorted(runs, key=lambda run: "termination" not in run.config):
+        of_task = split_task(changes[run.name])[0]
+        if "termination" not in run.config:
+            others = [place[1] for place in sorted(tasks) if place[0] == run.task]
+            same = [o for o in others if of_task == tuple(c for c in o if c[0] != "termination")]
+            of_task = next(iter(same), of_task)
+        tasks.setdefault((run.task, of_task), []).append(run)
+    return [_panel(*key, tasks[key], changes, own, keep) for key in sorted(tasks)]
 
 
 def _panel(
@@ -273,16 +292,16 @@ def _panel(
     runs: Sequence[RunRecord],
     changes: dict[str, Changes],
     own: Sequence[str],
+    keep: frozenset[str],
 ) -> Panel:
     others = {run.name: split_task(changes[run.name])[1] for run in runs}
-    shared = shared_changes(runs, others, ABLATION_KEYS)
+    shared = shared_changes(runs, others, keep)
     rows: dict[tuple[Any, ...], Row] = {}
     repeats = []
     for run in runs:
-        method = method_of(run)
         differing = tuple(change for change in others[run.name] if change not in shared)
-        number = own.index(method) if method in own else 0
-        key = (method, profile_of(run), differing, run.steps)
+        number = own.index(run.method) if run.method in own else 0
+        key = (run.method, profile_of(run), differing, run.steps)
         row = rows.setdefault(key, Row(*key, number=number))
         if run.seed in row.seeds:
             repeats.append(run)

@@ -1,4 +1,4 @@
-"""In what a run's settings differ from its recipe's own, and which of that makes it another row."""
+"""How a run's settings differ from its recipe's own, and which differences make another row."""
 
 from __future__ import annotations
 
@@ -7,45 +7,33 @@ from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
 from functools import cache
-from typing import Any
+from typing import Any, get_type_hints
 
+from giril_rl.config.compose import groups, resolved
 from giril_rl.config.leaves import flat
+from giril_rl.config.recipe_config import config_class
+from giril_rl.config.recipe_files import find, shipped
+from giril_rl.config.schema import AveragedRunConfig
 from giril_rl.errors import UserError
-from giril_rl.experiments.report.runs import RunRecord
-from giril_rl.experiments.report.style import TRUE_REWARD, is_own
-from giril_rl.runs.naming import NO_EFFECT
+from giril_rl.experiments.report.entries import PLAYER, TRUE_REWARD, entry, is_own
+from giril_rl.experiments.report.reading import RunRecord
+from giril_rl.methods import ControlRunConfig
+from giril_rl.rewards.method import Method, registered
+from giril_rl.runs.identity import ADDED, NO_EFFECT
 
-WITHOUT_PROFILE = frozenset(
-    {"expert", TRUE_REWARD, "gail", "vail", "bc", "control:random", "control:held_action"}
-)
-"""Methods that never average rewards over environments, so that both profiles are one run."""
-_OF_REWARDS = ("fit.", "demo.", "expert.", "giril.", "icm.")
-_NOT_READ: dict[str, tuple[str, ...]] = {
-    "control:constant": _OF_REWARDS,
-    "control:copy": ("fit.", "icm."),
-    "control:untrained_giril": ("fit.", "icm."),
-    "control:untrained_icm": ("fit.", "giril."),
-    "control:random": (*_OF_REWARDS, "ppo.", "scaling."),
-    "control:held_action": (*_OF_REWARDS, "ppo.", "scaling."),
-}
-"""Settings that a control has and does not use, by how their keys begin."""
-# What rows and panels are told apart by, and not by a change of settings.
+# Other fields of a row or a panel hold these.
 _IDENTITY = NO_EFFECT | {"recipe", "seed", "steps", "task.name", "task.steps"}
 _IDENTITY |= {"profile", "batch_mean"}
 Changes = tuple[tuple[str, str], ...]
-"""``(key, value as text)`` of the settings that are not the recipe's own, by key."""
+"""``(key, value as text)`` of the settings that differ from the recipe's own, by key."""
 
 
 @cache
 def _defaults(recipe: str, task: str, env_id: str) -> dict[str, Any] | None:
-    """A shipped recipe's own settings on a task, flat; None where there is no such recipe.
+    """A shipped recipe's own settings on a task, flat; None for any other recipe.
 
-    A run that somebody sent may name any file, which is not to be run.
+    The settings of somebody else's run may name any file: it must not be executed.
     """
-    from giril_rl.config.compose import resolved
-    from giril_rl.config.recipe_config import config_class
-    from giril_rl.config.recipe_files import shipped
-
     try:
         found = {each.name: each for each in shipped()}[recipe]
         config = resolved(found, config_class(found), [_task_word(task, env_id)])[0]
@@ -55,17 +43,24 @@ def _defaults(recipe: str, task: str, env_id: str) -> dict[str, Any] | None:
 
 
 @cache
-def _task_word(task: str, env_id: str) -> str:
-    from giril_rl.config.compose import groups
-    from giril_rl.config.recipe_files import find
+def _never_averages() -> frozenset[str]:
+    """Shipped recipes whose rewards are averaged in neither profile."""
+    return frozenset(
+        each.name for each in shipped() if not issubclass(config_class(each), AveragedRunConfig)
+    )
 
+
+@cache
+def _task_word(task: str, env_id: str) -> str:
     known = task in groups(find("control"))["task"][0]
     return f"task={task}" if known else f"task.env_id={env_id}"
 
 
-def task_word(run: RunRecord) -> str:
-    """How a run's task is named on the command line."""
-    return _task_word(str(run.config["task.name"]), str(run.config.get("task.env_id")))
+def task_words(run: RunRecord, recipe: str, changes: Changes) -> list[str]:
+    """The overrides that give a shipped recipe a run's task with those changes that it knows."""
+    known = _defaults(recipe, run.task, run.env_id) or {}
+    words = [f"{key}={value}" for key, value in changes if key in known]
+    return [_task_word(run.task, run.env_id), *words]
 
 
 def text_of(value: Any) -> str:
@@ -76,33 +71,43 @@ def text_of(value: Any) -> str:
         ('null', 'true', '[64,64]', '0.5')
     """
     if value is None or isinstance(value, bool):
-        return {None: "null", True: "true", False: "false"}[value]
+        return json.dumps(value)
     return str(value).replace(" ", "") if isinstance(value, list) else str(value)
 
 
 def changes_of(runs: Sequence[RunRecord]) -> dict[str, Changes]:
-    """For each run's name, the settings that differ from what its recipe has for its task.
+    """For each run's name, the settings that differ from its recipe's own for that task.
 
-    A run of a recipe that is not shipped is compared with what most runs of that recipe have. A
-    key that a run was made without, before it existed, is no difference.
+    Runs of a recipe that is not shipped are compared with the settings that most of them have. A
+    key that a run lacks, because it is older than the key, is no difference.
     """
     usual = _usual(runs)
     found = {}
     for run in runs:
-        task, env_id = str(run.config["task.name"]), str(run.config.get("task.env_id"))
-        base = _defaults(run.recipe, task, env_id) or usual[run.recipe, task]
+        base = ADDED | (_defaults(run.recipe, run.task, run.env_id) or usual[run.recipe, run.task])
         differing = {
             key: text_of(value)
             for key, value in run.config.items()
             if key not in _IDENTITY
-            and _reads(run, key)
             and not (key in base and base[key] == value)
+            and _reads(run, key)
         }
-        # Asking for another player or recording is asking for none that is shipped.
+        # A request for another player or recording implies that the shipped one is not used.
         if differing.get("demo.path") == "null" and any(map(_of_players, differing)):
             del differing["demo.path"]
         found[run.name] = tuple(sorted(differing.items()))
     return found
+
+
+def _usual(runs: Iterable[RunRecord]) -> dict[tuple[str, str], dict[str, Any]]:
+    values: dict[tuple[str, str], dict[str, list[Any]]] = defaultdict(lambda: defaultdict(list))
+    for run in runs:
+        for key, value in run.config.items():
+            values[run.recipe, run.task][key].append(value)
+    return {
+        place: {key: max(each, key=each.count) for key, each in found.items()}
+        for place, found in values.items()
+    }
 
 
 def _of_players(key: str) -> bool:
@@ -111,52 +116,47 @@ def _of_players(key: str) -> bool:
 
 
 def _reads(run: RunRecord, key: str) -> bool:
-    """Whether a setting tells the run from others of its method.
-
-    What stops early is called otherwise, and a control's reward is a part of its name.
-    """
-    method = method_of(run)
+    """Whether a setting has an effect on the run that its method's name does not tell."""
     if key == "stop_early":
-        return method != TRUE_REWARD
+        return run.method != TRUE_REWARD
     if key == "reward":
         return run.recipe != "control"
-    return not key.startswith(_NOT_READ.get(method, ()))
+    return not key.startswith(_ignored(entry(run.method)))
+
+
+@cache
+def _ignored(about: Method) -> tuple[str, ...]:
+    """How those keys of the recipe ``control`` begin that a control ignores, by its entry."""
+    if about.kind != "control" or is_own(about.name):
+        return ()
+    of_rewards = {other.settings for other in registered().values()} - {None, about.settings}
+    parts = get_type_hints(ControlRunConfig).items()
+    found = [f"{name}." for name, kind in parts if kind in of_rewards]
+    if about.trained != "before":
+        found.append("fit.")
+    if not about.demonstration:
+        found += ["demo.", "expert."]
+    if about.build is None:  # It has no reward, and so no policy to train.
+        found += ["ppo.", "scaling.", "batch_mean"]
+    return tuple(found)
 
 
 def profile_of(run: RunRecord) -> str | None:
     """``released`` if rewards were averaged over environments, else ``paper``.
 
-    None for what averages nothing in either profile: the shipped recipes that are known for it, and
-    runs whose result says so.
+    None if both profiles give the same run.
     """
-    no_difference = (run.result or {}).get("profile", "unknown") is None
-    if no_difference or method_of(run) in WITHOUT_PROFILE:
+    same = run.result.get("profile", "unknown") is None or run.recipe in _never_averages()
+    if same or not _reads(run, "batch_mean"):
         return None
     averaged = run.config.get("batch_mean", run.config.get("profile") == "released")
     return "released" if averaged else "paper"
 
 
-def method_of(run: RunRecord) -> str:
-    """The run's method; an expert that takes its whole budget is one to compare with."""
-    whole = run.method == "expert" and run.config.get("stop_early") is False
-    return TRUE_REWARD if whole else run.method
-
-
-def _usual(runs: Iterable[RunRecord]) -> dict[tuple[str, str], dict[str, Any]]:
-    values: dict[tuple[str, str], dict[str, list[Any]]] = defaultdict(lambda: defaultdict(list))
-    for run in runs:
-        for key, value in run.config.items():
-            values[run.recipe, str(run.config["task.name"])][key].append(value)
-    return {
-        place: {key: max(each, key=each.count) for key, each in found.items()}
-        for place, found in values.items()
-    }
-
-
 def split_task(changes: Changes) -> tuple[Changes, Changes]:
     """The changes that make the task another one, and the others.
 
-    How long an expert is trained is none of the task's.
+    The training of the task's expert is not part of the task.
 
     Examples:
         >>> split_task((("ppo.lr", "0.1"), ("task.horizon", "fixed"), ("termination", "bootstrap")))
@@ -167,36 +167,28 @@ def split_task(changes: Changes) -> tuple[Changes, Changes]:
         for key, value in changes
         if key == "termination" or (key.startswith("task.") and not key.startswith("task.expert_"))
     )
-    return of_task, tuple(c for c in changes if c not in of_task)
+    return of_task, tuple(change for change in changes if change not in of_task)
 
 
 def shared_changes(
     runs: Sequence[RunRecord], changes: Mapping[str, Changes], keep: frozenset[str]
 ) -> Changes:
-    """Changes that all runs of one task have in common: the study's own settings, no row's.
+    """Changes that all runs of one task share: they describe the study and make no rows.
 
-    A key counts where runs of at least two methods have it and all that have it agree. What a
-    recipe of the user's own has usually is no change of it, and agrees as well.
-
-    Args:
-        runs: runs of one task.
-        changes: of each run, by its name.
-        keep: keys that a table is about; they always make rows.
+    A change counts if runs of at least two methods have its key and all of them agree. Your own
+    recipe agrees if its usual value is the same. The keys in ``keep`` always make rows.
     """
     candidates = {change for run in runs for change in changes[run.name] if change[0] not in keep}
     found = []
-    for change in sorted(candidates):
+    for key, value in sorted(candidates):
         having = [
-            run
-            for run in runs
-            if change[0] in run.config and _reads(run, change[0]) and method_of(run) != "expert"
+            run for run in runs if key in run.config and _reads(run, key) and run.method != PLAYER
         ]
-        methods = {method_of(run) for run in having}
-        agree = (
-            change in changes[run.name]
-            or (is_own(run.method) and text_of(run.config[change[0]]) == change[1])
+        agree = all(
+            (key, value) in changes[run.name]
+            or (is_own(run.method) and text_of(run.config[key]) == value)
             for run in having
         )
-        if len(methods) > 1 and all(agree):
-            found.append(change)
+        if agree and len({run.method for run in having}) > 1:
+            found.append((key, value))
     return tuple(found)

@@ -19,8 +19,7 @@ from giril_rl.config.schema import ExpertRunConfig
 from giril_rl.errors import UserError
 from giril_rl.experiments.study.spec import Group, Spec, override_text
 from giril_rl.files.disk import read_json
-from giril_rl.runs.naming import config_hash, is_scored_as, out_folder
-from giril_rl.runs.sources import check_sources, sources
+from giril_rl.runs.identity import check_sources, config_hash, is_scored_as, out_folder, sources
 
 _STUDYS_OWN = ("out", "root")
 

@@ -14,7 +14,7 @@ from giril_rl.experiments.study.plan import StudyRun
 from giril_rl.experiments.study.spec import Spec
 from giril_rl.files.disk import csv_text, write_atomically, write_json
 from giril_rl.files.untrusted import parse_json, read_text
-from giril_rl.runs.naming import config_hash, safe
+from giril_rl.runs.identity import config_hash, safe
 
 State = Literal["waiting", "running", "finished", "failed", "interrupted"]
 
