@@ -31,7 +31,8 @@ class Leaf:
     @property
     def choices(self) -> tuple[str, ...] | None:
         """The only texts allowed, None where any is."""
-        return self.metadata.get("choices")
+        choices = self.metadata.get("choices")
+        return tuple(choices()) if callable(choices) else choices
 
     @property
     def line(self) -> str:

@@ -7,7 +7,7 @@ A field's type is what Hydra enforces, its default is the value used, its ``help
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -26,7 +26,7 @@ def knob(
     default: Any,
     help: str,
     *,
-    choices: Sequence[str] | None = None,
+    choices: Sequence[str] | Callable[[], Collection[str]] | None = None,
     low: float | None = None,
     high: float | None = None,
     low_open: bool = False,
@@ -37,7 +37,7 @@ def knob(
     Args:
         default: value used when nothing else is said; ``MISSING`` makes the knob mandatory.
         help: one line, shown by ``--help``.
-        choices: the only texts allowed.
+        choices: the only texts allowed, or a function that returns them when they are needed.
         low: smallest number allowed; in a list, of each entry.
         high: largest number allowed; in a list, of each entry.
         low_open: ``low`` itself is not allowed.
@@ -53,7 +53,7 @@ def knob(
     """
     metadata = {
         "help": help,
-        "choices": tuple(choices) if choices else None,
+        "choices": choices if callable(choices) else tuple(choices or ()) or None,
         "low": low,
         "high": high,
         "low_open": low_open,
