@@ -25,8 +25,11 @@ autodoc_typehints_description_target = "documented"
 napoleon_use_ivar = True
 nitpicky = False
 
+pages = {
+    name: "controls" if method.kind == "control" else name for name, method in methods().items()
+}
 rows = [
-    f"| [{method.label}](methods/{'controls' if method.kind == 'control' else name}.md) | {method.trained} |"
+    f"| [{method.label}](methods/{pages[name]}.md) | {method.trained} |"
     for name, method in methods().items()
 ]
 myst_substitutions = {

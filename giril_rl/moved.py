@@ -1,15 +1,18 @@
-"""Old names, for one deprecation cycle: they work, warn and name the new one."""
+"""Old names of modules and of what is in them, for one deprecation cycle: they work and warn."""
 
 from __future__ import annotations
 
+import functools
 import importlib.util
 import sys
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Sequence
 from importlib.abc import Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec
 from types import ModuleType
-from typing import Any
+from typing import Any, TypeVar, cast
+
+Function = TypeVar("Function", bound=Callable[..., Any])
 
 MOVED = {
     "configs": "config.schema",
@@ -35,21 +38,68 @@ MOVED = {
     "rewards.noise": "rewards.controls",
     "rewards.pixel_scaler": "rewards.scaler",
     "rewards.transition_loss": "rewards.fitting",
+    "training.adversarial": "training.reward_trainers",
     "training.checkpoint": "runs.checkpoint",
+    "training.clone": "training.cloning",
+    "training.evaluate": "training.scoring",
+    "training.expert": "training.demonstrations",
+    "training.fit": "training.fitting",
     "training.run": "runs.run",
 }
-"""Modules that version 0.1 documented, or that its recipes import, below ``giril_rl``."""
-
-MOVED_NAMES: Mapping[str, Mapping[str, str]] = {
-    "config.schema": {
-        "AdversarialConfig": "rewards",
-        "BottleneckConfig": "rewards",
-        "ControlRunConfig": "methods.controls",
-        "CuriosityConfig": "rewards",
-        "GenerativeConfig": "rewards",
-    },
+"""Modules below ``giril_rl`` that version 0.1 documented, or a copied recipe of its imports."""
+NAMES = {
+    "config.schema.AdversarialConfig": "rewards",
+    "config.schema.BottleneckConfig": "rewards",
+    "config.schema.ControlRunConfig": "methods",
+    "config.schema.CuriosityConfig": "rewards",
+    "config.schema.GenerativeConfig": "rewards",
+    "configs.RunConfig": "config.schema:AveragedRunConfig",
+    "training.AdversarialLearner": "training.deprecated",
+    "training.PPOLearner": "training.deprecated",
+    "training.RewardLearner": "training.deprecated",
+    "training.bottleneck_reward": "rewards",
+    "training.control_reward": "methods",
+    "training.curiosity_reward": "rewards",
+    "training.discriminator_reward": "rewards",
+    "training.generative_reward": "rewards",
+    "training.train_ppo": "training.deprecated",
 }
-"""Names that left a module that is still there, and the modules that they are in now."""
+"""Names that went to another module than the rest of theirs, as ``MODULE`` or ``MODULE:NAME``. A
+module that is still there finds its own by ``__getattr__ = forwarding(__name__)``."""
+
+
+def forwarding(module: str) -> Callable[[str], Any]:
+    """A module's ``__getattr__``, which looks :data:`NAMES` up in their new places.
+
+    Args:
+        module: the module's full name.
+
+    Examples:
+        >>> forwarding("giril_rl.training")("anything")
+        Traceback (most recent call last):
+        ...
+        AttributeError: module 'giril_rl.training' has no attribute 'anything'
+    """
+    below = module.partition(".")[2]
+
+    def find(name: str) -> Any:
+        new = NAMES.get(f"{below}.{name}")
+        if new is not None:
+            new, _, renamed = new.partition(":")
+            renamed = renamed or name
+            _warn(f"{module}.{name}", f"giril_rl.{new}.{renamed}")
+            return getattr(importlib.import_module(f"giril_rl.{new}"), renamed)
+        if below in MOVED:
+            return getattr(importlib.import_module(f"giril_rl.{MOVED[below]}"), name)
+        raise AttributeError(f"module {module!r} has no attribute {name!r}")
+
+    return find
+
+
+def _warn(old: str, new: str) -> None:
+    warnings.warn(
+        f"{old} is now {new}; the old name goes in version 0.3.", DeprecationWarning, stacklevel=3
+    )
 
 
 class MovedModules(MetaPathFinder, Loader):
@@ -75,36 +125,44 @@ class MovedModules(MetaPathFinder, Loader):
         return importlib.util.spec_from_loader(fullname, self)
 
     def exec_module(self, module: ModuleType) -> None:
-        """Looks all names up in the module's new place."""
+        """Lets the module find all names in its new place."""
         old = module.__name__
         new = f"giril_rl.{MOVED[old.partition('.')[2]]}"
-        warnings.warn(
-            f"{old} is now {new}; the old name goes in version 0.3.",
-            DeprecationWarning,
-            stacklevel=2,
-        )
-        found = importlib.import_module(new)
-        module.__getattr__ = found.__getattribute__  # type: ignore[method-assign]
+        _warn(old, new)
+        # At once: who looks through all modules for an attribute must not start an import.
+        importlib.import_module(new)
+        module.__getattr__ = forwarding(old)  # type: ignore[method-assign]
 
 
 def install() -> None:
-    """Lets the old names be imported, which is asked for once."""
+    """Makes the old names importable."""
     if not any(isinstance(finder, MovedModules) for finder in sys.meta_path):
         sys.meta_path.append(MovedModules())
 
 
-def find(module: str, name: str) -> Any:
-    """What ``name`` of ``module`` is now, for the ``__getattr__`` of a module in MOVED_NAMES.
+def renamed_argument(old: str, new: str) -> Callable[[Function], Function]:
+    """Lets a function take its argument ``new`` by its old name too, with a warning.
 
-    Raises:
-        AttributeError: if the module never had the name.
+    Examples:
+        >>> @renamed_argument("held_out", "validation")
+        ... def fit(validation=None):
+        ...     return validation
+        >>> with warnings.catch_warnings(record=True) as said:
+        ...     warnings.simplefilter("always")
+        ...     fit(held_out=3)
+        3
+        >>> print(said[0].message)
+        fit(held_out=...) is now validation=; the old name goes in version 0.3.
     """
-    new = MOVED_NAMES[module].get(name)
-    if new is None:
-        raise AttributeError(f"module 'giril_rl.{module}' has no attribute {name!r}")
-    warnings.warn(
-        f"giril_rl.{module}.{name} is now giril_rl.{new}.{name}; the old name goes in version 0.3.",
-        DeprecationWarning,
-        stacklevel=3,
-    )
-    return getattr(importlib.import_module(f"giril_rl.{new}"), name)
+
+    def decorate(function: Function) -> Function:
+        @functools.wraps(function)
+        def call(*args: Any, **kwargs: Any) -> Any:
+            if old in kwargs:
+                _warn(f"{function.__name__}({old}=...)", f"{new}=")
+                kwargs[new] = kwargs.pop(old)
+            return function(*args, **kwargs)
+
+        return cast(Function, call)
+
+    return decorate

@@ -8,8 +8,7 @@ from short_runs import weights
 
 from giril_rl.cli.command_line import main
 from giril_rl.config.compose import resolved
-from giril_rl.config.recipe_config import config_class
-from giril_rl.config.recipe_files import find
+from giril_rl.config.recipes import config_class, find
 from giril_rl.errors import UserError
 from giril_rl.runs.metrics import read_metrics
 
@@ -89,8 +88,8 @@ def test_profile_horizon_and_termination_change_nothing_and_the_seed_does(root, 
             "bc.stop=held_out needs transitions to hold out and demo.subsample=1 leaves none: set "
             "demo.subsample to at least 2, or bc.stop=fixed.",
         ),
-        (["bc.stop=x"], "bc.stop=x: choose one of held_out, fixed."),
-        (["bc.min_std=0"], "bc.min_std=0.0 must be above 0."),
+        (["bc.stop=x"], "bc.stop=x must be 'held_out' or 'fixed'."),
+        (["bc.min_std=0"], "bc.min_std=0.0 must be greater than 0."),
     ],
 )
 def test_refusals(words, sentence):

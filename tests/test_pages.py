@@ -26,8 +26,7 @@ import yaml
 
 from giril_rl.cli.command_line import main
 from giril_rl.cli.parser import Parser
-from giril_rl.config.recipe_config import config_class
-from giril_rl.config.recipe_files import Recipe
+from giril_rl.config.recipes import Recipe, config_class
 from giril_rl.experiments.study.spec import Spec, read_spec
 
 ROOT = Path(__file__).parents[1]

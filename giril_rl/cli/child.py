@@ -1,8 +1,7 @@
-"""A study's run in a process of its own, which ends when the study's process is gone.
+"""``python -m giril_rl.cli.child WORDS``: ``giril WORDS`` as a child process of a study.
 
-``python -m giril_rl.cli.child WORDS`` does what ``giril WORDS`` does. Its standard input is a
-pipe of which only the study's process has the other end: the system closes that end however the
-process dies, also by ``kill -9``, when nothing can be sent any more.
+It stops when the study's process is gone. Its standard input is a pipe whose other end only the
+study's process has: the system closes that end however the process dies, even by ``kill -9``.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ def watch(descriptor: int = 0) -> None:
     """Waits for the pipe's other end to close, then asks this process to save its state and stop.
 
     Args:
-        descriptor: the end of the pipe that is read; nothing is ever written to the other.
+        descriptor: the end of the pipe to read; nothing is ever written to the other.
     """
     os.read(descriptor, 1)
     # Not sys.stderr: its buffer may be in the middle of a write.

@@ -1,16 +1,16 @@
-"""The parser of every subcommand."""
+"""The argument parser of every subcommand."""
 
 from __future__ import annotations
 
 import argparse
 from typing import NoReturn
 
-from giril_rl.config.schema import MOST
+from giril_rl.config.knobs import MOST
 from giril_rl.errors import UserError
 
 
 class Parser(argparse.ArgumentParser):
-    """Refuses in one sentence, as everything of the command line does.
+    """Refuses wrong arguments in one sentence, as the whole command line does.
 
     Examples:
         >>> Parser("giril ls").parse_args(["--all"])
@@ -20,7 +20,7 @@ class Parser(argparse.ArgumentParser):
     """
 
     def error(self, message: str) -> NoReturn:
-        """Raises what argparse has to say."""
+        """Raises argparse's message."""
         raise UserError(f"{message}; see `{self.prog} --help`.")
 
     def add_imports(self) -> None:
@@ -36,10 +36,7 @@ class Parser(argparse.ArgumentParser):
 
 
 def check_number(option: str, number: int | None, *, least: int) -> None:
-    """Refuses a whole number that is too small, or larger than any that is read back.
-
-    Raises:
-        UserError: in one sentence.
+    """Refuses an integer that is too small, or larger than files can keep.
 
     Examples:
         >>> check_number("--seed", 2**63, least=0)

@@ -1,7 +1,7 @@
 """Modules of the user's own, whose import registers environments.
 
-A module is imported only because the user named it: on the command line, in a recipe or in Python.
-What a run's folder, a demonstration or a study's file names is not imported for that.
+A module is imported only if the user named it: on the command line, in a recipe or in Python. What
+a run's folder, a demonstration or a study's file names is not.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _MODULE = re.compile(r"[^\W\d]\w*(\.[^\W\d]\w*)*")
 def named_modules(env_id: object, imports: object = ()) -> list[str]:
     """The modules that settings name: those of ``imports``, and the one before an id's colon.
 
-    The settings may be of a file that anybody wrote: what is no module's name is passed over.
+    Anybody may have written the settings: what is not the name of a module is passed over.
 
     Examples:
         >>> named_modules("my_envs:Ball-v0", ["more.envs", "my_envs"])
@@ -38,11 +38,13 @@ def named_modules(env_id: object, imports: object = ()) -> list[str]:
     return list(dict.fromkeys(named))
 
 
-def check_names(imports: Iterable[str]) -> None:
-    """Refuses what cannot be a module's name.
+def modules_of(config: Any) -> list[str]:
+    """:func:`named_modules` of a recipe's ``Config``."""
+    return named_modules(config.task.env_id, config.imports)
 
-    Raises:
-        UserError: in one sentence.
+
+def check_names(imports: Iterable[str]) -> None:
+    """Refuses what cannot be the name of a module.
 
     Examples:
         >>> check_names(["my_envs", "a.b"])
@@ -60,13 +62,11 @@ def check_names(imports: Iterable[str]) -> None:
 
 
 def search_in(*folders: Path) -> None:
-    """Lets modules be found in these folders too, after all that is installed.
+    """Lets Python find modules in these folders too.
 
-    After, so that a file there cannot take the place of a package.
+    They come last, so that a file there cannot take the place of an installed package.
     """
-    for folder in folders:
-        if str(folder) not in sys.path:
-            sys.path.append(str(folder))
+    sys.path += [str(folder) for folder in folders if str(folder) not in sys.path]
 
 
 def import_modules(names: Sequence[str], *folders: Path) -> None:
@@ -74,11 +74,10 @@ def import_modules(names: Sequence[str], *folders: Path) -> None:
 
     Args:
         names: the modules.
-        folders: where they are looked for besides the installed packages.
+        folders: where to look besides the installed packages.
 
     Raises:
-        UserError: for one that is not found or cannot be imported, naming it and where it was
-            looked for.
+        UserError: for one that is not found or cannot be imported.
 
     Examples:
         >>> import_modules(["no_such_module"], Path("/my/folder"))
@@ -104,13 +103,8 @@ def import_modules(names: Sequence[str], *folders: Path) -> None:
             ) from error
 
 
-def check_found(names: Iterable[str], *folders: Path) -> None:
-    """Refuses modules that could not be found, without importing anything.
-
-    Raises:
-        UserError: as :func:`import_modules`.
-    """
-    names = list(names)
+def check_found(names: Sequence[str], *folders: Path) -> None:
+    """Refuses modules that :func:`import_modules` would not find, without importing anything."""
     if names:
         search_in(*folders)
     for name in names:
@@ -120,7 +114,7 @@ def check_found(names: Iterable[str], *folders: Path) -> None:
 
 
 def missing(name: str, error: ModuleNotFoundError, *folders: Path) -> UserError:
-    """The refusal of a module that is not there, or that needs one that is not."""
+    """The refusal of a module, or of a recipe's file, that needs one that is not there."""
     absent = error.name or name
     who = f"there is no module {absent}"
     if not name.startswith(absent):
@@ -128,8 +122,3 @@ def missing(name: str, error: ModuleNotFoundError, *folders: Path) -> UserError:
     places = " or ".join(dict.fromkeys(f"in {folder}" for folder in folders))
     where = f"among the installed packages{' or ' if places else ''}{places}"
     return UserError(f"{who} {where}: install it, or put it there.")
-
-
-def modules_of(config: Any) -> list[str]:
-    """:func:`named_modules` of a recipe's ``Config``."""
-    return named_modules(config.task.env_id, config.imports)

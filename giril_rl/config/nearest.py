@@ -1,37 +1,21 @@
-"""What a mistyped word was probably meant to be."""
+"""Suggestions for mistyped names."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from difflib import SequenceMatcher
+from difflib import get_close_matches
 
 
-def _ratio(one: str, other: str) -> float:
-    return SequenceMatcher(None, one, other).ratio()
+def nearest(key: str, candidates: Iterable[str]) -> list[str]:
+    """The names that a mistyped, possibly dotted one most resembles, at most three.
 
-
-def _initials(name: str) -> str:
-    return "".join(word[0] for word in name.split("_") if word)
-
-
-def _likeness(key: str, candidate: str) -> float:
-    parent, _, last = key.rpartition(".")
-    candidate_parent, _, candidate_last = candidate.rpartition(".")
-    if last == candidate_last or (len(candidate_last) > 1 and _initials(last) == candidate_last):
-        # The right name in the wrong part, or `learning_rate` for `lr`.
-        return 0.9 + 0.1 * _ratio(parent, candidate_parent)
-    if parent == candidate_parent:
-        return _ratio(last, candidate_last)
-    return max(_ratio(key, candidate), 0.9 * _ratio(last, candidate_last))
-
-
-def nearest(key: str, candidates: Iterable[str], cutoff: float = 0.6) -> list[str]:
-    """The candidates that a mistyped dotted key resembles most, at most three, ties together.
+    :mod:`difflib` compares the parts before and after the last dot one at a time, so that the right
+    name in the wrong part is found. It cannot know that ``learning_rate`` means ``lr``: initials
+    count as an exact match.
 
     Args:
         key: what was written.
         candidates: what could have been meant.
-        cutoff: likeness in [0, 1] below which nothing is suggested.
 
     Examples:
         >>> nearest("ppo.learning_rate", ["ppo.lr", "fit.lr", "ppo.clip"])
@@ -39,11 +23,19 @@ def nearest(key: str, candidates: Iterable[str], cutoff: float = 0.6) -> list[st
         >>> nearest("lr", ["ppo.lr", "fit.lr", "ppo.clip"])
         ['fit.lr', 'ppo.lr']
     """
-    scores = {candidate: round(_likeness(key, candidate), 3) for candidate in candidates}
-    best = max(scores.values(), default=0.0)
-    if best < cutoff:
-        return []
-    return sorted(candidate for candidate, score in scores.items() if score == best)[:3]
+    parent, _, name = key.rpartition(".")
+    everywhere = [candidate.rpartition(".") for candidate in candidates]
+    close = get_close_matches(parent, sorted({part for part, _, _ in everywhere}), n=1)
+    here = [found for found in everywhere if found[0] in close]
+    initials = "".join(word[:1] for word in name.split("_"))
+    exact = {name, initials} if len(initials) > 1 else {name}
+    for group in (here, everywhere):
+        if same := [found for found in group if found[2] in exact]:
+            return sorted("".join(found) for found in same)[:3]
+    for group in (here, everywhere):
+        if similar := get_close_matches(name, sorted({found[2] for found in group}), n=1):
+            return sorted("".join(found) for found in group if found[2] in similar)[:3]
+    return []
 
 
 def did_you_mean(key: str, candidates: Iterable[str]) -> str:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from itertools import product
 from typing import Any
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -11,7 +12,7 @@ from hydra.errors import OverrideParseException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from giril_rl.config.leaves import Leaf, flat, leaves
+from giril_rl.config.knobs import Knob, flat, knobs
 from giril_rl.config.nearest import did_you_mean
 from giril_rl.errors import UserError
 
@@ -36,7 +37,7 @@ def parse(texts: Sequence[str]) -> list[Override]:
             raise UserError(f"{text!r} is not of the form key=value.")
         try:
             (override,) = OverridesParser.create().parse_overrides([text])
-        except (OverrideParseException, ValueError):  # The latter of thousands of digits.
+        except (OverrideParseException, ValueError):  # The latter for thousands of digits.
             raise UserError(
                 f"{text}: the value cannot be read; put text with special characters in quotes, "
                 f"such as {key}=\"'{value}'\"."
@@ -52,14 +53,14 @@ def normalised(override: Override) -> str:
     return f"{override.get_key_element()}={override.get_value_element_as_str()}"
 
 
-def leaf_words(texts: Sequence[str]) -> dict[str, str]:
+def words_by_key(texts: Sequence[str]) -> dict[str, str]:
     """``key=value`` texts by key, a mapping as one text for each of its entries.
 
     Raises:
         UserError: as :func:`parse`, and for a key that is given twice.
 
     Examples:
-        >>> leaf_words(["seed=3", "ppo={lr:1e-3,hidden:[8,8]}"])
+        >>> words_by_key(["seed=3", "ppo={lr:1e-3,hidden:[8,8]}"])
         {'seed': 'seed=3', 'ppo.lr': 'ppo.lr=0.001', 'ppo.hidden': 'ppo.hidden=[8,8]'}
     """
     words: dict[str, str] = {}
@@ -81,10 +82,10 @@ def leaf_words(texts: Sequence[str]) -> dict[str, str]:
 class KeyCheck:
     """Checks keys and types against a recipe's ``Config``, one override at a time.
 
-    Hydra would refuse the same overrides, in several lines that speak of its internals.
+    Hydra refuses the same overrides, in several lines about its internals.
 
     Args:
-        recipe: what names the recipe on the command line, for messages.
+        recipe: the recipe's name or path, for messages.
         config: its ``Config`` class.
         groups: config groups and their choices.
     """
@@ -92,7 +93,7 @@ class KeyCheck:
     def __init__(self, recipe: str, config: type[Any], groups: Mapping[str, Sequence[str]]) -> None:
         self.recipe = recipe
         self.groups = groups
-        self.leaves: dict[str, Leaf] = {leaf.key: leaf for leaf in leaves(config)}
+        self.knobs: dict[str, Knob] = {knob.key: knob for knob in knobs(config)}
         self._scratch: DictConfig = OmegaConf.structured(config)
 
     def override(self, override: Override) -> None:
@@ -106,67 +107,53 @@ class KeyCheck:
         key = override.get_key_element()
         if override.is_sweep_override():
             raise UserError(f"{text} gives several values: add -m to run one after another.")
-        if key in self.groups:
-            if override.value() not in self.groups[key]:
-                known = ", ".join(self.groups[key])
-                if key == "task":
-                    known += ", or give a Gymnasium id, such as task.env_id=ALE/Pong-v5"
-                raise UserError(f"{text}: choose one of {known}.")
-            return
-        for leaf_key, value in _flat(key, override.value(), self.leaves):
-            self.value(leaf_key, value, text)
+        if key not in self.groups:
+            self.value(key, override.value(), text)
+        elif override.value() not in self.groups[key]:
+            known = ", ".join(self.groups[key])
+            if key == "task":
+                known += ", or give a Gymnasium id, such as task.env_id=ALE/Pong-v5"
+            raise UserError(f"{text}: choose one of {known}.")
+
+    def settings(self, settings: Mapping[str, Any], file: str) -> None:
+        """Check the settings of a recipe's YAML, which a copy may have wrong.
+
+        Raises:
+            UserError: names the file, then the key.
+        """
+        for key, value in flat(settings, keep_empty=True).items():
+            self.value(key, value, f"{key}={value}", where=f"{file}: ")
 
     def value(self, key: str, value: Any, text: str, where: str = "") -> None:
         """Check one dotted key and its value; ``text`` is how the user wrote it."""
-        if key not in self.leaves:
-            inside = [name for name in self.leaves if name.startswith(f"{key}.")]
+        if key not in self.knobs:
+            inside = [name for name in self.knobs if name.startswith(f"{key}.")]
+            if inside and isinstance(value, Mapping) and not value:
+                return
             if inside:
                 raise UserError(
                     f"{where}{text}: {key} holds several keys; set one, such as {inside[0]}."
                 )
-            hint = did_you_mean(key, [*self.leaves, *self.groups]) or self._help(key)
+            hint = did_you_mean(key, [*self.knobs, *self.groups]) or self._help(key)
             raise UserError(f"{where}{key!r} is not a key of {self.recipe}{hint}")
         try:
             OmegaConf.update(self._scratch, key, value, merge=False)
         except (OmegaConfBaseException, OverflowError):
-            leaf = self.leaves[key]
-            hint = f", such as {int(value)}" if _is_whole(value) and "whole" in leaf.needed else ""
-            raise UserError(f"{where}{text}: {leaf.needed} is needed{hint}.") from None
+            needed = self.knobs[key].needed
+            whole = isinstance(value, float) and value.is_integer() and "whole" in needed
+            hint = f", such as {int(value)}" if whole else ""
+            raise UserError(f"{where}{text}: {needed} is needed{hint}.") from None
 
     def _help(self, key: str) -> str:
         part = key.rpartition(".")[0]
-        names = [name.rpartition(".")[2] for name in self.leaves if name.startswith(f"{part}.")]
+        names = [name.rpartition(".")[2] for name in self.knobs if name.startswith(f"{part}.")]
         if part and names:
             return f": {part} has {', '.join(names)}."
         return f": see `giril run {self.recipe} --help`."
 
 
-def _is_whole(value: Any) -> bool:
-    return isinstance(value, float) and value.is_integer()
-
-
-def _flat(key: str, value: Any, known: Mapping[str, Leaf]) -> Iterator[tuple[str, Any]]:
-    if isinstance(value, Mapping) and key not in known:
-        for name, inner in value.items():
-            yield from _flat(f"{key}.{name}", inner, known)
-    else:
-        yield key, value
-
-
-def check_settings(check: KeyCheck, settings: Mapping[str, Any], file: str) -> None:
-    """Check a recipe's YAML as overrides are checked: a copy may hold the same mistakes.
-
-    Raises:
-        UserError: names the file, then the key.
-    """
-    for name, value in settings.items():
-        if name != "defaults":
-            for key, inner in _flat(str(name), value, check.leaves):
-                check.value(key, inner, f"{key}={inner}", where=f"{file}: ")
-
-
 def sweep(texts: Sequence[str]) -> list[list[str]]:
-    """All combinations of the values in ``texts``, as Hydra's basic sweeper makes them.
+    """All combinations of the values in ``texts``, the last one changing fastest.
 
     Raises:
         UserError: for a kind of sweep that has no list of values, such as ``interval(0, 1)``.
@@ -175,11 +162,13 @@ def sweep(texts: Sequence[str]) -> list[list[str]]:
         >>> sweep(["seed=0,1", "ppo.lr=0.1"])
         [['seed=0', 'ppo.lr=0.1'], ['seed=1', 'ppo.lr=0.1']]
     """
-    from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
-
-    parsed = parse(texts)
-    for override in parsed:
-        kind = override.value_type
-        if kind in (ValueType.INTERVAL_SWEEP, ValueType.GLOB_CHOICE_SWEEP):
+    listed = []
+    for override in parse(texts):
+        if override.value_type in (ValueType.INTERVAL_SWEEP, ValueType.GLOB_CHOICE_SWEEP):
             raise UserError(f"{override.input_line}: a sweep needs its values listed, such as a,b.")
-    return BasicSweeper.split_arguments(parsed, max_batch_size=None)[0]
+        if override.is_sweep_override():
+            key = override.get_key_element()
+            listed.append([f"{key}={value}" for value in override.sweep_string_iterator()])
+        else:
+            listed.append([normalised(override)])
+    return [list(job) for job in product(*listed)]

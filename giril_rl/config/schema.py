@@ -1,67 +1,23 @@
-"""The typed knobs of every recipe, one dataclass for each part.
+"""The settings of every recipe, one dataclass for each part.
 
-A field's type is what Hydra enforces, its default is the value used, its ``help`` is the line that
-``giril run RECIPE --help`` shows, and its ``choices`` or bounds are what
-:func:`giril_rl.config.validation.validate` checks. Nothing heavy is imported here.
+Hydra enforces a field's type; :func:`giril_rl.config.validation.validate` checks its bounds and
+choices and calls ``check`` of a class that has it; ``giril run RECIPE --help`` shows its line of
+help. Nothing heavy is imported here.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 from omegaconf import MISSING
 
-from giril_rl import moved
 from giril_rl.config.families import TaskFamily, family_of
+from giril_rl.config.knobs import default_text, knob
+from giril_rl.errors import UserError
+from giril_rl.moved import forwarding
 
-MOST = 2**63 - 1
-"""The largest whole number of any knob: what torch takes for a seed or a size, and files keep."""
 MOST_THREADS = 1024
 COMPILE = "torch.compile of gradient steps: for long training on frames, 20 seconds to begin"
-
-
-def knob(
-    default: Any,
-    help: str,
-    *,
-    choices: Sequence[str] | Callable[[], Collection[str]] | None = None,
-    low: float | None = None,
-    high: float | None = None,
-    low_open: bool = False,
-    high_open: bool = False,
-) -> Any:
-    """A dataclass field with a default, one line of help and what its value may be.
-
-    Args:
-        default: value used when nothing else is said; ``MISSING`` makes the knob mandatory.
-        help: one line, shown by ``--help``.
-        choices: the only texts allowed, or a function that returns them when they are needed.
-        low: smallest number allowed; in a list, of each entry.
-        high: largest number allowed; in a list, of each entry.
-        low_open: ``low`` itself is not allowed.
-        high_open: ``high`` itself is not allowed.
-
-    Examples:
-        >>> from dataclasses import dataclass, fields
-        >>> @dataclass
-        ... class Part:
-        ...     beta: float = knob(1.0, "a weight in (0, 1]", low=0, high=1, low_open=True)
-        >>> Part().beta, fields(Part)[0].metadata["help"]
-        (1.0, 'a weight in (0, 1]')
-    """
-    metadata = {
-        "help": help,
-        "choices": choices if callable(choices) else tuple(choices or ()) or None,
-        "low": low,
-        "high": high,
-        "low_open": low_open,
-        "high_open": high_open,
-    }
-    if isinstance(default, list):
-        return field(default_factory=lambda: list(default), metadata=metadata)
-    return field(default=default, metadata=metadata)
 
 
 def split_id(env_id: str) -> tuple[str | None, str]:
@@ -90,7 +46,7 @@ class TaskConfig:
     )
     steps: int = knob(1_000_000, "default policy steps for this task", low=1)
     demonstration: str | None = knob(
-        None, "what demo.path is where neither it nor an expert or a recording is asked for"
+        None, "default of demo.path, unless the demonstration, expert or recording is chosen"
     )
     expert_score: float | None = knob(None, "mean training return at which the expert stops early")
     expert_steps: int = knob(
@@ -98,7 +54,7 @@ class TaskConfig:
     )
     horizon: str = knob(
         "own",
-        "own: a failure ends an episode; fixed: only the time limit does (policy training only)",
+        "own: a failure ends an episode; fixed: only the time limit does (in policy training)",
         choices=("own", "fixed"),
     )
     after_failure: str = knob(
@@ -116,6 +72,23 @@ class TaskConfig:
     def family(self) -> TaskFamily:
         """What is known of the environment by its id alone."""
         return family_of(self.env_id)
+
+    def check(self, prefix: str, run: object) -> None:
+        """Refuses settings of another kind of task; see :func:`.validation.validate`."""
+        if self.horizon != "own" and not self.family.fixed_horizon:
+            raise UserError(
+                f"{prefix}horizon={self.horizon} is for vector tasks: leave {prefix}horizon=own."
+            )
+        if self.episode != "life" and not self.family.has_lives:
+            raise UserError(
+                f"{prefix}episode={self.episode} is for games, whose lives end episodes: leave "
+                f"{prefix}episode=life."
+            )
+        if self.after_failure != "reset" and self.horizon == "own":
+            raise UserError(
+                f"{prefix}after_failure={self.after_failure} means nothing where a failure ends "
+                f"the episode: add {prefix}horizon=fixed."
+            )
 
 
 @dataclass
@@ -152,6 +125,16 @@ class PPOConfig:
         batch = self.num_envs * self.rollout
         return -(-steps // batch) * batch
 
+    def check(self, prefix: str, run: object) -> None:
+        """Refuses a minibatch that does not divide the batch."""
+        batch = self.num_envs * self.rollout
+        if batch % self.minibatch:
+            raise UserError(
+                f"{prefix}minibatch={self.minibatch} does not divide {prefix}num_envs * "
+                f"{prefix}rollout = {self.num_envs} * {self.rollout} = {batch}: choose one that "
+                "does."
+            )
+
 
 @dataclass
 class ExpertConfig:
@@ -171,7 +154,7 @@ class ExpertConfig:
 
 @dataclass
 class DemoConfig:
-    """What is recorded from the expert and how much of it is used."""
+    """The demonstration: what is recorded from the expert, and how much of it is used."""
 
     path: str | None = knob(
         None,
@@ -190,6 +173,20 @@ class DemoConfig:
     deterministic: bool = knob(True, "play the expert's mean action rather than a sampled one")
     seed: int | None = knob(None, "seed of the recorded episodes; null takes the run's seed", low=0)
     subsample: int = knob(20, "keep 1 in k transitions, fixed once (paper: 20; 1 keeps all)", low=1)
+
+    def check(self, prefix: str, run: object) -> None:
+        """Refuses two lengths, none, or a subsample of nothing."""
+        length, episodes = default_text(self.length), default_text(self.episodes)
+        if (self.length is None) == (self.episodes is None):
+            raise UserError(
+                f"{prefix}length={length} and {prefix}episodes={episodes}: give exactly one of "
+                "them and set the other to null."
+            )
+        if self.length is not None and self.subsample > self.length:
+            raise UserError(
+                f"{prefix}subsample={self.subsample} leaves nothing of {prefix}length={length}: "
+                "choose a smaller one."
+            )
 
 
 @dataclass
@@ -245,7 +242,7 @@ class ScalingConfig:
 
 @dataclass
 class EvalConfig:
-    """Scoring on fresh environments, whole episodes, true reward."""
+    """Evaluation on fresh environments: whole episodes, true reward."""
 
     episodes: int = knob(20, "episodes for each of the deterministic and the sampled policy", low=1)
     seed: int = knob(10_000, "seed of the evaluation episodes", low=0)
@@ -253,7 +250,7 @@ class EvalConfig:
 
 @dataclass
 class RunConfig:
-    """What all recipes share."""
+    """Settings of every recipe."""
 
     task: TaskConfig = field(default_factory=TaskConfig)
     seed: int = knob(0, "seed of the policy's training", low=0)
@@ -312,7 +309,7 @@ class RewardRunConfig(DemoRunConfig):
     scaling: ScalingConfig = field(default_factory=ScalingConfig)
     termination: str = knob(
         "ends",
-        "ends: nothing comes after a failure; bootstrap: its value continues as after a time limit",
+        "ends: nothing follows a failure; bootstrap: its value continues, as after a time limit",
         choices=("ends", "bootstrap"),
     )
 
@@ -346,5 +343,4 @@ class UnaveragedRunConfig(RunConfig):
     termination: str = knob("ends", "no effect here", choices=("ends", "bootstrap"))
 
 
-def __getattr__(name: str) -> Any:
-    return moved.find("config.schema", name)
+__getattr__ = forwarding(__name__)  # Names of version 0.1.

@@ -1,5 +1,6 @@
 """Demonstrations: record, check, save, subsample, import and export."""
 
+from giril_rl.config.tasks import named_task
 from giril_rl.demos.check import check_demonstration
 from giril_rl.demos.demonstration import Demonstration
 from giril_rl.demos.importing import import_demonstration
@@ -9,7 +10,6 @@ from giril_rl.demos.record import record_demonstration
 from giril_rl.demos.replay import verify_by_replay
 from giril_rl.demos.shipped import shipped_demonstrations
 from giril_rl.demos.subsample import holdout, subsample
-from giril_rl.demos.task import named_task
 
 __all__ = [
     "Demonstration",

@@ -10,7 +10,6 @@ from typing import Any, TypeVar
 
 import yaml
 
-from giril_rl.config.leaves import leaves
 from giril_rl.config.schema import EvalConfig, TaskConfig
 from giril_rl.config.validation import validate
 from giril_rl.errors import UserError
@@ -103,9 +102,6 @@ def read_part(folder: Path, config: dict[str, Any], name: str, kind: type[Part])
     except (KeyError, TypeError, AttributeError):
         raise _no_run(folder) from None
     try:
-        for leaf in leaves(kind):
-            if not leaf.takes(getattr(part, leaf.key)):
-                raise UserError(f"{leaf.key}={getattr(part, leaf.key)}: {leaf.needed} is needed.")
         validate(part)
     except UserError as error:
         raise UserError(f"{folder / 'config.yaml'}: {name}.{error}") from None

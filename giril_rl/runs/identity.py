@@ -18,8 +18,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from giril_rl.config.leaves import flat
-from giril_rl.config.recipe_files import Recipe
+from giril_rl.config.knobs import flat
+from giril_rl.config.recipes import Recipe
 from giril_rl.config.schema import EvalConfig, ExpertRunConfig
 from giril_rl.errors import UserError
 from giril_rl.files.disk import read_json

@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 import yaml
 from filelock import FileLock, Timeout
 
-from giril_rl.config.leaves import flat
+from giril_rl.config.knobs import flat
 from giril_rl.errors import UserError, told
 from giril_rl.files.disk import (
     cannot_write,

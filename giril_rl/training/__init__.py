@@ -1,5 +1,6 @@
 """What recipes compose: a demonstration, reward training, the training loop, scores."""
 
+from giril_rl.moved import forwarding
 from giril_rl.policies import load_agent, make_agent
 from giril_rl.runs.run import Run
 from giril_rl.training.algorithm import Algorithm
@@ -46,3 +47,5 @@ __all__ = [
     "train_expert",
     "train_policy",
 ]
+
+__getattr__ = forwarding(__name__)  # Names of version 0.1.

@@ -13,6 +13,7 @@ from torchrl.objectives import BCLoss
 
 from giril_rl.config.schema import BCConfig
 from giril_rl.errors import UserError
+from giril_rl.moved import renamed_argument
 from giril_rl.networks.normalise import RunningNormaliser
 from giril_rl.policies import NORMALISED, PPOAgent
 from giril_rl.rewards.method import ORANGE, Method, register
@@ -28,6 +29,7 @@ CHECKPOINT_EVERY = 1_000
 register(Method("bc", "BC", ORANGE, settings=BCConfig, rank=4))
 
 
+@renamed_argument("held_out", "validation")
 def clone_behaviour(
     agent: PPOAgent,
     data: TensorDictBase,

@@ -11,6 +11,7 @@ from torchrl.objectives import LossModule
 
 from giril_rl.config.schema import FitConfig
 from giril_rl.graphs.gradients import TracedGradients
+from giril_rl.moved import renamed_argument
 from giril_rl.rewards.transitions import PIXELS_AT_ONCE
 from giril_rl.runs.checkpoint import restoring
 from giril_rl.runs.finite_checks import Finite
@@ -105,6 +106,7 @@ def run_fit(
     return seconds
 
 
+@renamed_argument("held_out", "validation")
 def fit_reward(
     loss: LossModule,
     data: TensorDictBase,

@@ -14,7 +14,7 @@ from torchrl.envs import Compose, SignTransform
 
 from giril_rl.config.imports import import_modules, modules_of
 from giril_rl.config.schema import ExpertConfig, ExpertRunConfig, RunConfig
-from giril_rl.config.task_defaults import apply_task_defaults
+from giril_rl.config.tasks import apply_task_defaults
 from giril_rl.envs import gym_factory, make_env, with_own_episodes
 from giril_rl.errors import UserError
 from giril_rl.files.disk import missing, remove_empty

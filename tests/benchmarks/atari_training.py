@@ -36,7 +36,7 @@ from stable_baselines3.common.vec_env import VecFrameStack
 from torchrl.envs import Compose
 
 from giril_rl.config.schema import RunConfig, TaskConfig
-from giril_rl.config.task_defaults import apply_task_defaults
+from giril_rl.config.tasks import apply_task_defaults
 from giril_rl.envs import make_env
 from giril_rl.rewards import GenerativeReward
 from giril_rl.runs.machine import keep_freed_memory

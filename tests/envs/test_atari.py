@@ -10,7 +10,7 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torchrl.envs.utils import check_env_specs
 
-from giril_rl.config.recipe_files import shipped_conf
+from giril_rl.config.recipes import shipped_conf
 from giril_rl.config.schema import TaskConfig
 from giril_rl.envs import AtariEnv, AtariGymEnv, for_scores, gym_factory, make_env
 from giril_rl.envs.atari import Opened
@@ -433,5 +433,5 @@ def test_refusals():
         make_env(TaskConfig(name="x", env_id="ALE/Brekout-v5"), 1, seed=0)
     with pytest.raises(UserError, match="brekout is not a game of ale-py; did you mean 'breakout'"):
         AtariGame("brekout")
-    with pytest.raises(UserError, match="choose one of life, game"):
+    with pytest.raises(UserError, match="must be 'life' or 'game'"):
         AtariGymEnv("breakout", episode="lives")

@@ -12,7 +12,7 @@ from giril_rl.cli.command_line import main
 from giril_rl.config import families
 from giril_rl.config.families import TaskFamily, family_of
 from giril_rl.config.schema import TaskConfig
-from giril_rl.config.task_defaults import task_defaults
+from giril_rl.config.tasks import task_defaults
 from giril_rl.envs import gym_factory, make_env, observation_kind, register_family
 from giril_rl.envs.gym_api import import_package
 from giril_rl.errors import UserError

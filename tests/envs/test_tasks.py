@@ -7,7 +7,7 @@ import pytest
 import torch
 import yaml
 
-from giril_rl.config.recipe_files import shipped_conf
+from giril_rl.config.recipes import shipped_conf
 from giril_rl.config.schema import TaskConfig
 from giril_rl.envs import gym_factory, make_env
 

@@ -8,7 +8,7 @@ import pytest
 from short_runs import rows, weights
 
 from giril_rl.cli.command_line import main
-from giril_rl.config.recipe_files import copy, find
+from giril_rl.config.recipes import copy, find
 from giril_rl.config.schema import TaskConfig
 from giril_rl.envs import GymVectorEnv, make_env
 from giril_rl.runs.checkpoint import load_state
@@ -222,15 +222,15 @@ def test_a_run_that_died_ends_as_an_undisturbed_one(words, root, tmp_path, monke
     [
         (
             ["control", "reward=bogus"],
-            "reward=bogus: choose one of constant, untrained_giril, untrained_icm, copy, noise, "
-            "negated_giril, centred_giril, random, held_action.",
+            "reward=bogus must be 'constant', 'untrained_giril', 'untrained_icm', 'copy', 'noise', "
+            "'negated_giril', 'centred_giril', 'random' or 'held_action'.",
         ),
-        (["control", "giril.beta=0"], "giril.beta=0.0 must be in (0, 1]."),
+        (["control", "giril.beta=0"], "giril.beta=0.0 must be greater than 0."),
         (
             ["cdil", "reward.features=all"],
-            "reward.features=all: choose one of inverse, both, none.",
+            "reward.features=all must be 'inverse', 'both' or 'none'.",
         ),
-        (["cdil", "reward.scale=0"], "reward.scale=0.0 must be above 0."),
+        (["cdil", "reward.scale=0"], "reward.scale=0.0 must be greater than 0."),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )

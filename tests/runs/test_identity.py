@@ -2,7 +2,7 @@ from dataclasses import asdict, dataclass, field, replace
 
 import pytest
 
-from giril_rl.config.leaves import leaves
+from giril_rl.config.knobs import knobs
 from giril_rl.config.schema import (
     EvalConfig,
     ExpertRunConfig,
@@ -52,7 +52,7 @@ def test_what_has_no_effect_is_in_no_hash():
     assert config_hash(watched) == config_hash(config)
     assert variant({"ppo.compile": "ppo.compile=True", "device": "device=cuda"}) == "default"
     kinds = (ExpertRunConfig, ControlRunConfig, Fitted, Adversarial)
-    assert {leaf.key for kind in kinds for leaf in leaves(kind)} >= NO_EFFECT
+    assert {knob.key for kind in kinds for knob in knobs(kind)} >= NO_EFFECT
 
 
 def test_later_keys_count_where_they_change_something():
@@ -71,6 +71,6 @@ def test_later_keys_count_where_they_change_something():
 
 def test_the_value_of_a_later_key_is_its_default():
     kinds = (ExpertRunConfig, ControlRunConfig)
-    defaults = {leaf.key for kind in kinds for leaf in leaves(kind)}
+    defaults = {knob.key for kind in kinds for knob in knobs(kind)}
     assert set(ADDED) <= defaults
     assert without_added(asdict(ExpertRunConfig(task=TASK))).get("termination") is None

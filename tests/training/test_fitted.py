@@ -12,8 +12,7 @@ import yaml
 from tensordict import TensorDict
 
 from giril_rl.config.compose import resolved
-from giril_rl.config.recipe_config import config_class
-from giril_rl.config.recipe_files import find
+from giril_rl.config.recipes import config_class, find
 from giril_rl.demos import Demonstration, shipped_demonstrations
 from giril_rl.errors import UserError
 from giril_rl.runs.identity import config_hash

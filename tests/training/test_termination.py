@@ -8,7 +8,7 @@ from torch import nn
 from torchrl.data import Bounded
 from torchrl.envs import Compose
 
-from giril_rl.config.recipe_files import shipped
+from giril_rl.config.recipes import shipped
 from giril_rl.config.schema import PPOConfig, TaskConfig
 from giril_rl.envs import make_env
 from giril_rl.errors import UserError

@@ -11,10 +11,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from giril_rl.config.compose import resolved
-from giril_rl.config.leaves import leaves
+from giril_rl.config.knobs import knobs
 from giril_rl.config.overrides import parse
-from giril_rl.config.recipe_config import config_class
-from giril_rl.config.recipe_files import find
+from giril_rl.config.recipes import config_class, find
 from giril_rl.errors import UserError
 from giril_rl.experiments.study.spec import read_spec
 from giril_rl.files.untrusted import parse_json, parse_yaml
@@ -22,7 +21,7 @@ from giril_rl.runs.checkpoint import load_state
 
 GIRIL = find("giril")
 CONFIG = config_class(GIRIL)
-KEYS = st.sampled_from([leaf.key for leaf in leaves(CONFIG)])
+KEYS = st.sampled_from([knob.key for knob in knobs(CONFIG)])
 VALUES = st.one_of(
     st.floats().map(str),
     st.integers().map(str),

@@ -140,66 +140,35 @@ def expert(change):
 
 
 RUN = {
-    # What the words themselves tell.
-    "command: unknown": (lambda: ["runn", "giril"], "'runn' is not a command; did you mean 'run'?"),
-    "recipe: unknown": (lambda: ["run", "girl"], "is not a recipe; did you mean 'giril'?"),
+    # Most refusals of the words themselves are in tests/config and tests/cli.
     "recipe: none": (lambda: ["run"], "name a recipe"),
-    "recipe: no such file": (lambda: ["run", "my.py"], "there is no file my.py"),
     "option: unknown": (lambda: ["run", "giril", "--sed=1"], "unrecognized arguments: --sed=1"),
     "task: unknown": (giril("task=inverted_pendulm"), "choose one of ant, atari,"),
     "task: a path": (giril("task=../profile/paper"), "choose one of ant"),
     "task: unknown id": (giril("task.env_id=CartPoll-v1"), "is not a Gymnasium id"),
     "task: a module's id": (giril("task.env_id=os:No-v1"), "is not a Gymnasium id that os"),
     "task: an id of no module": (giril("task.env_id=no_such:CartPole-v1"), "no module no_such"),
-    "task: no id": (giril("task=gymnasium"), "task.env_id has no value"),
-    "profile: unknown": (giril("profile=papr"), "choose one of paper, released."),
-    "key: unknown": (giril("seeed=1"), "'seeed' is not a key of giril; did you mean 'seed'"),
     "key: in the wrong part": (giril("reward.lr=1"), "did you mean 'fit.lr' or 'ppo.lr'"),
     "key: of another recipe": (giril("bc.steps=9"), "'bc.steps' is not a key of giril"),
-    "key: a whole part": (giril("ppo=3"), "ppo holds several keys"),
-    "key: twice": (giril("seed=1", "seed=2"), "seed is given twice"),
-    "key: added": (giril("+seed=1"), "keys can be changed, not added"),
-    "key: removed": (giril("~seed"), "keys can be changed, not added"),
-    "key: no value": (giril("seed"), "'seed' is not of the form key=value"),
     "key: Hydra's": (giril("hydra.searchpath=[pkg://os]"), "is not a key of giril"),
     "key: Hydra's group": (giril("hydra/launcher=x"), "is not a key of giril"),
     "key: _target_": (giril("reward._target_=os.system"), "'reward._target_' is not a key"),
-    "type: text for a number": (giril("seed=x"), "seed=x: a whole number is needed."),
-    "type: part of a number": (giril("steps=2e3"), "a whole number is needed, such as 2000."),
-    "type: null": (giril("seed=null"), "a whole number is needed."),
-    "type: number for a switch": (giril("fit.lr=true"), "a number is needed"),
-    "type: number for a list": (giril("ppo.hidden=64"), "a list of whole numbers"),
+    "type: text": (giril("seed=x"), "seed=x: a whole number is needed."),
     "type: mixed list": (giril("ppo.hidden=[64,a]"), "a list of whole numbers"),
     "type: unreadable": (giril("seed=[1"), "the value cannot be read"),
-    "value: several": (giril("seed=1,2"), "add -m to run one after another"),
-    "value: sweep without values": (giril("-m", "seed=interval(0,1)"), "needs its values listed"),
-    "value: last job of a sweep": (giril("-m", "reward.beta=1,2"), "must be in (0, 1]"),
-    "value: not a choice": (giril("reward.prior=flat"), "choose one of standard, conditional"),
-    "value: seed": (giril("seed=-1"), "seed=-1 must be at least 0."),
-    "value: a large seed": (giril(f"seed={10**22}"), f"seed={10**22}: at most {2**63 - 1} is"),
+    "value: last job of a sweep": (giril("-m", "reward.beta=1,2"), "must be less than or equal"),
     "value: a large seed of a part": (giril(f"demo.seed={2**64}"), "demo.seed=1844674407370955161"),
     "value: thousands of digits": (giril("seed=" + "9" * 5_000), "the value cannot be read"),
     "value: a number too large": (giril("ppo.lr=" + "9" * 400), "a number is needed"),
-    "value: NaN": (giril("ppo.lr=nan"), "a finite number is needed"),
-    "value: infinity": (giril("ppo.clip=inf"), "a finite number is needed"),
-    **{
-        f"beta: {beta}": (giril(f"reward.beta={beta}"), f"reward.beta={shown} must be in (0, 1].")
-        for beta, shown in {"0": "0.0", "1.01": "1.01", "-1": "-1.0", "1e9": "1000000000.0"}.items()
-    },
-    "beta: NaN": (giril("reward.beta=nan"), "reward.beta=nan: a finite number"),
-    "steps: none": (giril("steps=0"), "steps=0 must be at least 1."),
+    "value: NaN": (giril("reward.beta=nan"), "reward.beta=nan must be a finite number."),
     "steps: minibatch": (giril("ppo.minibatch=300"), "does not divide ppo.num_envs * ppo.rollout"),
     "steps: cloning": (lambda: ["run", "bc", "steps=10"], "cloning takes no environment steps"),
     "demo: both lengths": (giril("demo.episodes=1"), "give exactly one of them"),
-    "demo: nothing left": (giril("demo.subsample=2000"), "leaves nothing of demo.length=1000"),
     "reference: environment": (giril("logger=${oc.env:HOME}"), "only ${other.key}"),
     "reference: decoded": (giril("task.name=${oc.decode:x}"), "only ${other.key}"),
     "reference: nested": (giril("task.name='${oc.${profile}:x}'"), "only ${other.key}"),
     "reference: nowhere": (giril("task.name=${nowhere}"), "'nowhere' not found; write"),
-    "reference: itself": (
-        giril("task.name=${task.name}"),
-        "Recursive interpolation",
-    ),
+    "reference: itself": (giril("task.name=${task.name}"), "Recursive interpolation"),
 }
 DEMONSTRATIONS = {
     "nowhere": (lambda: words("demo.path=nowhere"), "nowhere is not a demonstration"),
@@ -352,11 +321,11 @@ LEFT_BEHIND = {
     "eval: config without a task": (evaluated(text("config.yaml", "eval: {}")), "no readable"),
     "eval: config of another type": (
         evaluated(text("config.yaml", "{task: {name: a, env_id: 5}, eval: {}}")),
-        "config.yaml: task.env_id=5: text is needed.",
+        "config.yaml: task.env_id=5 must be a valid string.",
     ),
     "eval: config out of range": (
         evaluated(text("config.yaml", "{task: {name: a, env_id: b}, eval: {episodes: 0}}")),
-        "config.yaml: eval.episodes=0 must be at least 1.",
+        "config.yaml: eval.episodes=0 must be greater than or equal to 1.",
     ),
     "eval: config of an unknown id": (
         evaluated(text("config.yaml", "{task: {name: a, env_id: b}, eval: {}}")),
@@ -399,28 +368,12 @@ LEFT_BEHIND = {
     "show: a run": (lambda: ["demo", "show", run_folder()], "is not the folder of a demonstration"),
 }
 WRITTEN = {
-    "study: none": (lambda: ["study"], "name a study"),
-    "study: unknown": (lambda: ["study", "smok"], "did you mean 'smoke'?"),
-    "study: no file": (lambda: ["study", "no.yaml"], "there is no file no.yaml"),
-    "study: not YAML": (study("groups: ["), "mine.yaml, line 1"),
+    # Most refusals of a study's file are in tests/experiments/study.
+    "study: not YAML": (study("groups: ["), "mine.yaml is not valid YAML, line 1: "),
     "study: not UTF-8": (study(b"\xff\xfe\x00"), "cannot be read as YAML"),
-    "study: a list": (study("- a"), "is not a study: it needs `groups`"),
-    "study: an unknown key": (study("group: []"), "did you mean 'groups'?"),
-    "study: no groups": (study("groups: []"), "`groups` is missing"),
-    "study: no label": (study("groups: [{recipe: giril}]"), "group 1 has no label"),
-    "study: no recipe": (study("groups: [{label: a}]"), "has no recipe"),
-    "study: unknown recipe": (study("groups: [{label: a, recipe: girl}]"), "did you mean 'giril'?"),
-    "study: two labels": (
-        study("groups: [{label: a, recipe: bc}, {label: a, recipe: gail}]"),
-        "two groups have the label 'a'",
-    ),
     "study: a key twice": (study("title: a\ntitle: b\n"), "found duplicate key title"),
     "study: unknown knob": (group("    sed: 1\n"), "'sed' is not a key of giril"),
-    "study: wrong type": (group("    seed: x\n"), "seed=x: a whole number is needed"),
-    "study: beta": (group("    reward.beta: [1, 2]\n"), "must be in (0, 1]"),
-    "study: the same run twice": (group("    seed: [0, 0]\n"), "leave it out once"),
-    "study: out": (group("    out: x\n"), "out is not a knob of a study's runs"),
-    "study: jobs": (lambda: ["study", "smoke", "jobs=0"], "jobs=0 must be at least 1."),
+    "study: beta": (group("    reward.beta: [1, 2]\n"), "must be less than or equal to 1"),
     "study: root is a file": (
         lambda: ["study", "smoke", f"root={written('file', '')}"],
         "choose another root=.",
@@ -441,12 +394,6 @@ WRITTEN = {
         "cannot be composed",
     ),
 }
-SLOW = {
-    case
-    for number, case in enumerate({**RUN, **WRITTEN})
-    if number % 4 and not case.startswith(("reference", "copy"))
-}
-"""Composing takes a while, and most of these sentences are tested elsewhere without it."""
 CASES = {
     **RUN,
     **{f"demonstration: {name}": case for name, case in DEMONSTRATIONS.items()},
@@ -456,9 +403,7 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize(
-    "case", [pytest.param(c, marks=pytest.mark.slow) if c in SLOW else c for c in CASES]
-)
+@pytest.mark.parametrize("case", CASES)
 def test_wrong_input_is_refused_in_one_sentence_and_changes_nothing(case, here, capsys):
     argv, sentence = CASES[case]
     argv = argv()

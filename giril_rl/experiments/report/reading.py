@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import yaml
 
 from giril_rl.config.families import TaskFamily, family_of
-from giril_rl.config.leaves import flat
+from giril_rl.config.knobs import flat
 from giril_rl.errors import UserError
 from giril_rl.experiments.report.entries import PLAYER, TRUE_REWARD
 from giril_rl.files.untrusted import parse_json, parse_yaml, read_text

@@ -10,9 +10,8 @@ from functools import cache
 from typing import Any, get_type_hints
 
 from giril_rl.config.compose import groups, resolved
-from giril_rl.config.leaves import flat
-from giril_rl.config.recipe_config import config_class
-from giril_rl.config.recipe_files import find, shipped
+from giril_rl.config.knobs import flat
+from giril_rl.config.recipes import config_class, find, shipped
 from giril_rl.config.schema import AveragedRunConfig
 from giril_rl.errors import UserError
 from giril_rl.experiments.report.entries import PLAYER, TRUE_REWARD, entry, is_own

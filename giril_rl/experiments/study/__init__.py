@@ -1,1 +1,1 @@
-"""Many runs from one file: a grid declared in YAML, checked as a whole, run several at a time."""
+"""Many runs from one YAML file: checked as a whole, made several at a time."""

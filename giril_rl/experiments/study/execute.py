@@ -1,4 +1,4 @@
-"""The loop that makes a study's runs, several at a time, and survives their deaths and Ctrl-C."""
+"""The loop that makes a study's runs, several at a time; it survives killed runs and Ctrl-C."""
 
 from __future__ import annotations
 
@@ -10,41 +10,17 @@ from collections.abc import Iterator, Sequence
 from itertools import islice
 from pathlib import Path
 from types import FrameType
-from typing import Protocol
 
 from filelock import FileLock, Timeout
 
 from giril_rl.errors import INTERRUPTED
-from giril_rl.experiments.study.config import StudyConfig
-from giril_rl.experiments.study.logs import last_line
+from giril_rl.experiments.study.launchers import Launcher
 from giril_rl.experiments.study.plan import StudyRun
-from giril_rl.experiments.study.status import StudyFolder
+from giril_rl.experiments.study.spec import StudyConfig
+from giril_rl.experiments.study.status import StudyFolder, last_line
 from giril_rl.runs.progress import progress
 
-PAUSE = 0.1  # seconds between looks at the runs
-
-
-class Launcher(Protocol):
-    """Where runs are made: processes of this machine, or a cluster."""
-
-    @property
-    def slots(self) -> int:
-        """How many runs it has room for."""
-
-    def start(self, run: StudyRun, log: Path) -> None:
-        """Start a run; what it prints is added to ``log``."""
-
-    def poll(self) -> list[tuple[StudyRun, int]]:
-        """Runs that have ended since the last call, with their exit codes."""
-
-    def interrupt(self) -> None:
-        """Ask all runs to save their state and stop."""
-
-    def kill(self) -> None:
-        """Stop all runs at once."""
-
-    def close(self) -> None:
-        """Leave nothing running."""
+PAUSE = 0.1  # Seconds between polls.
 
 
 class Signals:
@@ -61,7 +37,7 @@ class Signals:
 
     @contextlib.contextmanager
     def caught(self) -> Iterator[None]:
-        """Counts inside the block; a signal that is ignored stays so."""
+        """Counts inside the block; a signal that was ignored stays ignored."""
         numbers = [
             number
             for number in (signal.SIGINT, signal.SIGTERM)
@@ -78,13 +54,13 @@ class Signals:
 def execute(study: StudyFolder, launcher: Launcher, settings: StudyConfig) -> None:
     """Make all runs that have no result yet; ``study.standings`` says how each ended.
 
-    Experts go first. A run whose process was killed is started again, up to ``settings.retries``
-    times, and resumes. A run whose folder another process holds is waited for. The first Ctrl-C
-    lets the runs save their state, the second kills them.
+    Experts go first. A run whose process was killed starts again and resumes, up to
+    ``settings.retries`` times. The study waits for a run that another process is making. The first
+    Ctrl-C lets the runs save their state, the second kills them.
 
     Args:
         study: the study; its status files are written whenever something changes.
-        launcher: where the runs are made; closed at the end.
+        launcher: makes the runs; closed at the end.
         settings: the study's own settings.
     """
     waiting = [run for run in study.runs if not run.finished]
@@ -134,7 +110,7 @@ def execute(study: StudyFolder, launcher: Launcher, settings: StudyConfig) -> No
 
 
 def startable(waiting: Sequence[StudyRun], running: Sequence[StudyRun]) -> Iterator[StudyRun]:
-    """Runs that may start, experts first; the others wait until their task's experts are made."""
+    """Runs that may start, experts first; the others wait for the experts of their task."""
     experts = [run for run in (*waiting, *running) if run.goes_first]
     expected = {run.config.task.name for run in experts}
     for run in sorted(waiting, key=lambda run: not run.goes_first):
@@ -162,7 +138,7 @@ def _ended(
     *,
     stopped: bool,
 ) -> bool:
-    """Notes how a run's process ended; whether the run is to be started again."""
+    """Records how a run's process ended, and tells whether to start the run again."""
     standing = study.standings[run.name]
     standing.exit_code, standing.seconds = code, round(seconds, 1)
     if code == 0 and run.finished:

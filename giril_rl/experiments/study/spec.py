@@ -1,4 +1,4 @@
-"""A study's YAML: groups of runs, each a recipe with its knobs, a list of values sweeping."""
+"""A study's YAML file, groups of runs with lists of values, and the study's own settings."""
 
 from __future__ import annotations
 
@@ -7,13 +7,29 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from giril_rl.config.leaves import flat
+from giril_rl.config.knobs import flat
 from giril_rl.config.nearest import did_you_mean
-from giril_rl.config.recipe_files import shipped_conf
+from giril_rl.config.recipes import load_yaml, shipped_conf
+from giril_rl.config.schema import knob
 from giril_rl.errors import UserError
-from giril_rl.files.untrusted import check_yaml, read_text
 
 _KEYS = ("title", "all", "groups")
+
+
+@dataclass
+class StudyConfig:
+    """The settings of `giril study` itself; every other key is a knob of the runs."""
+
+    jobs: int | None = knob(
+        None,
+        "runs at a time; null: one for each core, or CPU of the cluster, and per_gpu for each GPU",
+        low=1,
+    )
+    launcher: str = knob("local", "local processes, or a Ray cluster", choices=("local", "ray"))
+    ray_address: str = knob("auto", "the cluster's address; auto: one that runs on this machine")
+    per_gpu: int = knob(4, "runs with device=cuda that share a GPU", low=1)
+    retries: int = knob(2, "how often a run is started again whose process was killed", low=0)
+    root: str = knob("runs", "where runs, experts, demonstrations and studies are kept")
 
 
 @dataclass(frozen=True)
@@ -24,8 +40,8 @@ class Group:
         label: the group's name.
         recipes: names of recipes or paths of copied ones.
         knobs: ``{dotted key: value}``; see :func:`override_text` for lists.
-        player: whether its runs are the experts that the others record, which the command line's
-            ``steps=`` is not for.
+        player: whether its runs are the experts that the other groups record; the command line's
+            ``steps=`` is not for them.
     """
 
     label: str
@@ -36,12 +52,12 @@ class Group:
 
 @dataclass(frozen=True)
 class Spec:
-    """A study as it is written down.
+    """The content of a study's file.
 
     Attributes:
         name: the file's name without its suffix.
         title: one line about it.
-        groups: its groups, each with the knobs that all of them have.
+        groups: its groups, each with the knobs of ``all`` as well.
     """
 
     name: str
@@ -50,7 +66,7 @@ class Spec:
 
 
 def shipped_studies() -> dict[str, Path]:
-    """The studies that come with the package, by name.
+    """The shipped studies, by name.
 
     Examples:
         >>> "smoke" in shipped_studies()
@@ -85,12 +101,16 @@ def find_study(text: str) -> Path:
 
 
 def read_spec(path: Path) -> Spec:
-    """Read a study's file; its knobs are checked later, by their recipes.
+    """Read a study's file; its recipes check the knobs later.
 
     Raises:
         UserError: where the file is not valid YAML or not a study.
     """
-    content = _load(path)
+    from omegaconf import OmegaConf
+
+    content = OmegaConf.to_container(load_yaml(path), resolve=False)
+    if not isinstance(content, dict):
+        raise UserError(f"{path} is not a study: it needs `groups`, a list.")
     for key in content:
         if key not in _KEYS:
             hint = did_you_mean(str(key), _KEYS) or f": a study has {', '.join(_KEYS)}."
@@ -105,28 +125,6 @@ def read_spec(path: Path) -> Spec:
         if sum(group.label == label for group in found) > 1:
             raise UserError(f"{path}: two groups have the label {label!r}: give each its own.")
     return Spec(path.stem, str(content.get("title") or ""), found)
-
-
-def _load(path: Path) -> dict[str, Any]:
-    import yaml
-    from omegaconf import DictConfig, OmegaConf
-    from omegaconf.errors import OmegaConfBaseException
-
-    try:
-        check_yaml(read_text(path))
-        # OmegaConf's reader knows 1e-4 for a number and refuses a key that is given twice.
-        loaded = OmegaConf.load(path)
-        content = OmegaConf.to_container(loaded, resolve=False)
-    except yaml.YAMLError as error:
-        mark = getattr(error, "problem_mark", None)
-        line = f", line {mark.line + 1}" if mark else ""
-        problem = getattr(error, "problem", None) or "not valid YAML"
-        raise UserError(f"{path}{line}: {problem}; correct it.") from error
-    except (OSError, ValueError, OmegaConfBaseException) as error:
-        raise UserError(f"{path} cannot be read as YAML: {str(error).splitlines()[0]}.") from error
-    if not isinstance(loaded, DictConfig) or not isinstance(content, dict):
-        raise UserError(f"{path} is not a study: it needs `groups`, a list.")
-    return content  # type: ignore[return-value]
 
 
 def _group(path: Path, number: int, entry: Any, shared: Mapping[str, Any]) -> Group:
@@ -145,8 +143,8 @@ def _group(path: Path, number: int, entry: Any, shared: Mapping[str, Any]) -> Gr
 def override_text(key: str, value: Any, *, is_list: bool = False) -> str:
     """A knob of a study as ``key=value``, in the grammar of ``giril run -m``.
 
-    A list of values sweeps. For a knob that is itself a list, a list is one value and a list of
-    lists sweeps. Text is taken as it would be on the command line, or quoted where it could not be.
+    A list of values is a sweep. For a knob that is itself a list, a list is one value and a list of
+    lists a sweep. Text that the command line could not read is quoted.
 
     Args:
         key: the knob's dotted key.
@@ -184,5 +182,5 @@ def _readable(text: str, *, alone: bool) -> bool:
         (override,) = parse([text])
     except UserError:
         return False
-    # Beside other values, text that is itself a list of values would become more of them.
+    # Beside other values, text with commas would become several.
     return alone or not override.is_sweep_override()

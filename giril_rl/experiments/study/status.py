@@ -1,7 +1,8 @@
-"""What a study's folder keeps: the resolved study, and how each of its runs stands."""
+"""A study's folder: the resolved study, the state of each run, and what the runs print."""
 
 from __future__ import annotations
 
+import os
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
@@ -16,24 +17,27 @@ from giril_rl.files.disk import csv_text, write_atomically, write_json
 from giril_rl.files.untrusted import parse_json, read_text
 from giril_rl.runs.identity import config_hash, safe
 
+MOST_BYTES = 2**20
+"""The size of a log beyond which a new one is begun; a study may be started any number of times."""
+_TAIL = 2**16
 State = Literal["waiting", "running", "finished", "failed", "interrupted"]
 
 
 @dataclass
 class Standing:
-    """How one run stands; a row of ``status.csv`` and an entry of ``status.json``.
+    """The state of one run: a row of ``status.csv`` and an entry of ``status.json``.
 
     Attributes:
         label: the group's label.
         recipe: the recipe's name.
         task: the task's name.
         seed: the run's seed.
-        state: where it stands.
-        attempts: processes that were started for it by the latest command.
-        exit_code: of the last process; negative: the number of the signal that killed it.
-        seconds: how long the last process took.
-        folder: the run's folder, seen from the study's root.
-        log: the log file, seen from the study's folder.
+        state: of the run.
+        attempts: processes that the latest command started for it.
+        exit_code: of the last process; if negative, of the signal that killed it.
+        seconds: the duration of the last process.
+        folder: the run's folder, relative to the study's root.
+        log: the log file, relative to the study's folder.
         last_line: the log's last line, where the run failed.
     """
 
@@ -55,7 +59,7 @@ class StudyFolder:
 
     Args:
         spec: the study.
-        changes: what the command line changed; it is a part of the folder's name.
+        changes: what the command line changed, a part of the folder's name.
         runs: the study's runs.
     """
 
@@ -72,7 +76,7 @@ class StudyFolder:
         }
 
     def _before(self) -> dict[str, Standing]:
-        """The finished runs that the folder knows of, with what they took."""
+        """The finished runs that the folder knows of, with their durations."""
         try:
             rows = parse_json(read_text(self.path / "status.json"))["runs"]
             known = [Standing(**row) for row in rows]
@@ -96,15 +100,15 @@ class StudyFolder:
         )
 
     def log(self, run: StudyRun) -> Path:
-        """The file that the run's output goes to."""
+        """The file of the run's output."""
         return self.path / self.standings[run.name].log
 
     def count(self, state: State) -> int:
-        """How many runs are in that state."""
+        """The number of runs in that state."""
         return Counter(standing.state for standing in self.standings.values())[state]
 
     def write_study(self) -> None:
-        """Write ``study.yaml``: the study with what the command line changed, and its runs."""
+        """Write ``study.yaml``: the study, the command line's changes, and the runs."""
         content = {
             "name": self.spec.name,
             "title": self.spec.title,
@@ -141,3 +145,37 @@ class StudyFolder:
 class _Plain(yaml.SafeDumper):
     def ignore_aliases(self, data: object) -> bool:
         return True
+
+
+def begin_log(log: Path, command: list[str]) -> None:
+    r"""Adds a command to a log, and renames a log that is too long to ``NAME.log.old`` first.
+
+    Args:
+        log: the file; its folder is made if need be.
+        command: the words after ``giril``.
+
+    Examples:
+        >>> import tempfile
+        >>> log = Path(tempfile.mkdtemp()) / "a.log"
+        >>> _ = log.write_text("x" * (MOST_BYTES + 1))
+        >>> begin_log(log, ["run", "bc"])
+        >>> log.read_text(), sorted(path.name for path in log.parent.iterdir())
+        ('\n$ giril run bc\n', ['a.log', 'a.log.old'])
+    """
+    log.parent.mkdir(parents=True, exist_ok=True)
+    if log.is_file() and log.stat().st_size > MOST_BYTES:
+        os.replace(log, log.with_name(f"{log.name}.old"))
+    with open(log, "ab") as output:
+        output.write(f"\n$ giril {' '.join(command)}\n".encode())
+
+
+def last_line(log: Path) -> str:
+    """The last line of a log that is not blank, or an empty text."""
+    try:
+        with open(log, "rb") as file:
+            file.seek(max(os.fstat(file.fileno()).st_size - _TAIL, 0))
+            text = file.read().decode("utf-8", errors="replace")
+    except OSError:
+        return ""
+    lines = [line.strip() for line in text.splitlines() if line.strip()]
+    return lines[-1] if lines else ""

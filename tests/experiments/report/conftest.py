@@ -9,8 +9,7 @@ import yaml
 from matplotlib.figure import Figure
 
 from giril_rl.config.compose import resolved
-from giril_rl.config.recipe_config import config_class
-from giril_rl.config.recipe_files import find
+from giril_rl.config.recipes import config_class, find
 from giril_rl.runs.identity import config_hash
 
 

@@ -7,12 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from short_runs import TINY
 
 from giril_rl.cli.command_line import main
 from giril_rl.config.compose import resolved
 from giril_rl.config.imports import import_modules
-from giril_rl.config.recipe_config import config_class
+from giril_rl.config.recipes import config_class
 from giril_rl.experiments.study.plan import Planner
 from giril_rl.experiments.study.spec import read_spec
 
@@ -37,7 +36,8 @@ class Own(gymnasium.Env):
 
 gymnasium.register("Own-v0", entry_point=Own, max_episode_steps=20)
 """
-WORDS = [*TINY, "steps=16", "eval.episodes=2"]
+TINY = ["ppo.num_envs=2", "ppo.rollout=8", "ppo.minibatch=8", "ppo.epochs=1", "ppo.hidden=[4]"]
+TINY += ["steps=16", "eval.episodes=2", "logger=null"]
 
 
 @pytest.fixture
@@ -56,14 +56,8 @@ def own(tmp_path, monkeypatch):
     forget()
 
 
-def refused(capsys, *words):
-    capsys.readouterr()
-    assert main(words) == 2
-    return capsys.readouterr().err.splitlines()[-1].removeprefix("giril: ")
-
-
-def test_a_run_on_it_is_made_and_scored(own, capsys):
-    words = ["run", "control", "task.env_id=own_envs:Own-v0", *WORDS]
+def test_a_run_on_it_is_made_and_scored(own, refused):
+    words = ["run", "control", "task.env_id=own_envs:Own-v0", *TINY]
     assert main(words) == 0
     run = "runs/control/own_envs-Own-v0/"
     (result,) = Path(run).glob("*/seed0/result.json")
@@ -71,7 +65,7 @@ def test_a_run_on_it_is_made_and_scored(own, capsys):
     folder = str(result.parent)
     assert main(["eval", folder]) == 0  # The module is imported already.
     own()
-    assert refused(capsys, "eval", folder) == (
+    assert refused("eval", folder) == (
         f"{folder} names the module own_envs, and reading a run imports nothing: if you trust it, "
         "add --import own_envs."
     )
@@ -80,7 +74,7 @@ def test_a_run_on_it_is_made_and_scored(own, capsys):
 
 
 def test_modules_may_be_named_apart_and_change_no_name(own):
-    assert main(["run", "control", "imports=[own_envs]", "task.env_id=Own-v0", *WORDS]) == 0
+    assert main(["run", "control", "imports=[own_envs]", "task.env_id=Own-v0", *TINY]) == 0
     (result,) = Path("runs/control/Own-v0").glob("*/seed0/result.json")
     assert "imports" not in result.parent.parent.name
     own()
@@ -92,7 +86,7 @@ def test_a_copied_recipe_finds_what_lies_beside_it(own, tmp_path, monkeypatch):
     Path("mine.py").write_text(Path("mine.py").read_text() + "\nimport own_envs\n")
     (tmp_path / "elsewhere").mkdir()
     monkeypatch.chdir("elsewhere")
-    assert main(["run", "../mine.py", "task.env_id=Own-v0", "out=o", *WORDS]) == 0
+    assert main(["run", "../mine.py", "task.env_id=Own-v0", "out=o", *TINY]) == 0
 
 
 @pytest.mark.parametrize(
@@ -116,13 +110,13 @@ def test_its_demonstrations_are_imported(own, words):
         ("", "task.env_id=own_envs:Own-v0 is not a Gymnasium id that own_envs registers: check it"),
     ],
 )
-def test_a_module_that_cannot_be_used_is_named(own, text, sentence, tmp_path, capsys, monkeypatch):
+def test_a_module_that_cannot_be_used_is_named(own, text, sentence, tmp_path, monkeypatch, refused):
     monkeypatch.setattr("gymnasium.registry", {})  # Other tests may have added what is near.
     Path("own_envs.py").unlink()
     shutil.rmtree("__pycache__", ignore_errors=True)
     if text is not None:
         Path("own_envs.py").write_text(text)
-    found = refused(capsys, "run", "control", "task.env_id=own_envs:Own-v0", *WORDS)
+    found = refused("run", "control", "task.env_id=own_envs:Own-v0", *TINY)
     assert found.startswith(sentence.replace("HERE", str(tmp_path)))
     assert not Path("runs").exists()
 
@@ -134,11 +128,11 @@ def test_an_installed_package_goes_before_a_file_of_its_name(own, tmp_path):
     assert Path(sys.modules["wave"].__file__).parent != tmp_path
 
 
-def test_a_study_names_modules_on_its_command_line(own, capsys):
+def test_a_study_names_modules_on_its_command_line(own, refused):
     Path("mine.yaml").write_text(
         "groups: [{label: a, recipe: control, task.env_id: 'own_envs:Own-v0'}]"
     )
-    assert refused(capsys, "study", "mine.yaml", "--dry-run") == (
+    assert refused("study", "mine.yaml", "--dry-run") == (
         "mine names the module own_envs, and a study's file alone imports nothing: if you trust "
         "it, add imports=[own_envs] to the command."
     )
@@ -147,5 +141,5 @@ def test_a_study_names_modules_on_its_command_line(own, capsys):
     assert (config.imports, config.task.env_id) == (["own_envs"], "own_envs:Own-v0")
     assert "own_envs" not in sys.modules  # Its run imports it, in a process of its own.
     Path("own_envs.py").unlink()
-    sentence = refused(capsys, "study", "mine.yaml", "imports=[own_envs]", "--dry-run")
+    sentence = refused("study", "mine.yaml", "imports=[own_envs]", "--dry-run")
     assert sentence.startswith("there is no module own_envs among the installed packages or in ")

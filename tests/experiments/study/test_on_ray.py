@@ -39,7 +39,7 @@ def test_a_worker_makes_a_run_as_the_command_does(study):
         .replace('if cfg.how == "user"', 'os.write(1, b"bare")\n    if cfg.how == "user"')
     )
     code = (
-        "from giril_rl.experiments.study.on_ray import run_in_worker as run; import sys;"
+        "from giril_rl.experiments.study.launchers import run_in_worker as run; import sys;"
         "from giril_rl.cli.command_line import main;"
         "sys.exit(run(main, ['run', 'fake.py', 'how=user'], "
         f"{str(Path('logs/a.log').absolute())!r}, "

@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 
 from giril_rl.cli.command_line import main
-from giril_rl.config import recipe_files as recipes
-from giril_rl.config.leaves import leaves
-from giril_rl.config.recipe_config import config_class
+from giril_rl.config import recipes
+from giril_rl.config.knobs import knobs
+from giril_rl.config.recipes import config_class
 
 FAKE = '''"""Fake: writes what it was given.
 
@@ -55,15 +55,6 @@ def fake(tmp_path, monkeypatch):
     Path("fake.py").write_text(FAKE)
     Path("fake.yaml").write_text(SETTINGS)
     return "fake.py"
-
-
-def refused(capsys, *argv):
-    assert main(argv) == 2
-    captured = capsys.readouterr()
-    (line,) = captured.err.splitlines()
-    assert captured.out == ""
-    assert line.startswith("giril: ") and line[-1] in ".?"
-    return line.removeprefix("giril: ")
 
 
 def read(folder):
@@ -121,14 +112,13 @@ def test_module_runs_as_a_script_and_returns_its_exit_code():
         (["cp", "girl", "a.py"], "'girl' is not a recipe; did you mean 'giril'?"),
         (["eval", "nowhere"], "there is no run folder nowhere."),
         (["eval", ".", "--episodes", "0"], "--episodes 0: at least 1 is needed."),
-        (["eval", ".", "--seed", "-1"], "--seed -1: at least 0 is needed."),
         (
             ["eval", ".", "--seed", "99999999999999999999999"],
             "--seed 99999999999999999999999: at most 9223372036854775807 is possible.",
         ),
         (
             ["run", "giril", "seed=99999999999999999999999"],
-            "seed=99999999999999999999999: at most 9223372036854775807 is possible.",
+            "seed=99999999999999999999999 must be less than or equal to 9223372036854775807.",
         ),
         (
             ["eval", ".", "--import", "my_envs"],
@@ -143,15 +133,15 @@ def test_module_runs_as_a_script_and_returns_its_exit_code():
         (["study"], "name a study: `giril study --help` shows them."),
         (["study", "smok"], "'smok' is not a study; did you mean 'smoke'?"),
         (["study", "no.yaml"], "there is no file no.yaml: write the study there, or name another."),
-        (["study", "smoke", "jobs=0"], "jobs=0 must be at least 1."),
-        (["study", "smoke", "launcher=slurm"], "launcher=slurm: choose one of local, ray."),
+        (["study", "smoke", "jobs=0"], "jobs=0 must be greater than or equal to 1, or null."),
+        (["study", "smoke", "launcher=slurm"], "launcher=slurm must be 'local' or 'ray'."),
         (["report", "nowhere"], "there is no folder nowhere."),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )
-def test_refusals(argv, sentence, capsys, tmp_path, monkeypatch):
+def test_refusals(argv, sentence, tmp_path, monkeypatch, refused):
     monkeypatch.chdir(tmp_path)
-    assert refused(capsys, *argv) == sentence.replace("HERE", str(tmp_path))
+    assert refused(*argv) == sentence.replace("HERE", str(tmp_path))
 
 
 def test_traceback_is_shown_when_asked_for(capsys):
@@ -168,10 +158,10 @@ def test_help_shows_every_knob_with_default_and_help(recipe, capsys, monkeypatch
     page = capsys.readouterr().out
     words = " ".join(page.split())
     lines = {line.split()[0]: line.split() for line in page.splitlines() if line.startswith("  ")}
-    for leaf in leaves(config_class(recipe)):
-        assert leaf.help, leaf.key
-        assert leaf.help in words
-        assert len(lines[leaf.key]) >= 3
+    for knob in knobs(config_class(recipe)):
+        assert knob.help, knob.key
+        assert knob.help in words
+        assert len(lines[knob.key]) >= 3
     assert "inverted_pendulum (default)" in page
     assert "released (default)" in page
 
@@ -190,11 +180,11 @@ def test_usage(argv, capsys):
     assert "giril run" in capsys.readouterr().out
 
 
-def test_copy_runs_with_its_own_changed_default(capsys, fake, monkeypatch):
+def test_copy_runs_with_its_own_changed_default(fake, monkeypatch, refused):
     assert main(["cp", "giril", "mine.py"]) == 0
     shipped = recipes.find("giril")
     assert Path("mine.py").read_text() == shipped.path.read_text()
-    assert refused(capsys_cleared(capsys), "cp", "giril", "mine.py").startswith("mine.py exists")
+    assert refused("cp", "giril", "mine.py").startswith("mine.py exists")
     Path("mine.py").write_text(FAKE.replace("knob(4", "knob(5"))
     settings = Path("mine.yaml").read_text() + "\nppo: {lr: 0.25}\n"
     Path("mine.yaml").write_text(settings)
@@ -204,24 +194,19 @@ def test_copy_runs_with_its_own_changed_default(capsys, fake, monkeypatch):
     assert kept["steps"] == 1_000_000
 
 
-def test_a_copy_whose_runs_would_have_another_recipes_name_is_refused(capsys, fake):
+def test_a_copy_whose_runs_would_have_another_recipes_name_is_refused(fake, refused):
     assert main(["cp", "giril", "gail.py"]) == main(["cp", "control", "mine.py"]) == 0
-    assert refused(capsys_cleared(capsys), "run", "gail.py") == (
+    assert refused("run", "gail.py") == (
         "gail.py has the name of the recipe gail, whose runs its own would be taken for: rename "
         "both files."
     )
     text = Path("mine.py").read_text()
     Path("mine.py").write_text(text.replace("recipe=Path(__file__).stem", 'recipe="control"'))
     line = text[: text.index("recipe=Path")].count("\n") + 1
-    assert refused(capsys, "run", "mine.py") == (
+    assert refused("run", "mine.py") == (
         f"{Path('mine.py').resolve()}, line {line}: its runs would be called 'control', not "
         "'mine' as the file: write recipe=Path(__file__).stem."
     )
-
-
-def capsys_cleared(capsys):
-    capsys.readouterr()
-    return capsys
 
 
 def test_a_config_that_needs_its_whole_file_is_found(fake):
@@ -232,14 +217,14 @@ def test_a_config_that_needs_its_whole_file_is_found(fake):
     assert read("o")["width"] == 6
 
 
-def test_imports_of_main_alone_are_not_run_for_help_and_refusals(fake, capsys):
+def test_imports_of_main_alone_are_not_run_for_help_and_refusals(fake, capsys, refused):
     python = FAKE.replace("import json\n", "import json\nimport not_installed_here\n")
     Path(fake).write_text(python)
     assert main(["run", fake, "--help"]) == 0
     assert "width" in capsys.readouterr().out
-    assert refused(capsys, "run", fake, "width=x") == "width=x: a whole number is needed."
+    assert refused("run", fake, "width=x") == "width=x: a whole number is needed."
     here = Path.cwd()
-    assert refused(capsys, "run", fake) == (
+    assert refused("run", fake) == (
         f"{here}/fake.py imports not_installed_here, and there is no such module among the "
         f"installed packages or in {here}: install it, or put it there."
     )
@@ -277,12 +262,12 @@ def test_a_folder_with_odd_characters_is_no_obstacle(fake, tmp_path, monkeypatch
         (FAKE + "\n(", SETTINGS, "is not valid Python"),
     ],
 )
-def test_broken_copies_are_refused(python, settings, part, capsys, tmp_path, monkeypatch):
+def test_broken_copies_are_refused(python, settings, part, tmp_path, monkeypatch, refused):
     monkeypatch.chdir(tmp_path)
     Path("bad.py").write_text(python)
     if settings is not None:
         Path("bad.yaml").write_text(settings)
-    assert part in refused(capsys, "run", "bad.py")
+    assert part in refused("run", "bad.py")
 
 
 def test_sweep_runs_every_combination(fake, capsys):
@@ -305,10 +290,10 @@ def test_sweep_goes_on_after_a_failure_and_lists_it(fake, capsys):
     assert captured.err.splitlines()[-3:] == tail
 
 
-def test_sweep_refuses_before_the_first_job(fake, capsys):
-    assert refused(capsys, "run", fake, "-m", "width=1,0") == "width=0 must be at least 1."
+def test_sweep_refuses_before_the_first_job(fake, refused):
+    assert refused("run", fake, "-m", "width=1,0") == "width=0 must be greater than or equal to 1."
     text = "two jobs would share the folder o: leave out= to giril, or vary it."
-    assert refused(capsys, "run", fake, "-m", "seed=1,2", "out=o") == text
+    assert refused("run", fake, "-m", "seed=1,2", "out=o") == text
     assert not Path("runs").exists()
 
 

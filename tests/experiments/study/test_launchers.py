@@ -1,5 +1,7 @@
 """What runs with ``device=cuda`` ask for, on Ray and on this machine; no GPU is needed."""
 
+import runpy
+import signal
 import sys
 from importlib.machinery import ModuleSpec
 from pathlib import Path
@@ -8,8 +10,7 @@ from types import ModuleType, SimpleNamespace
 import pytest
 
 from giril_rl.errors import UserError
-from giril_rl.experiments.study.local import LocalLauncher
-from giril_rl.experiments.study.on_ray import RayLauncher
+from giril_rl.experiments.study.launchers import LocalLauncher, RayLauncher
 
 
 def a_run(name, device="cuda"):
@@ -80,3 +81,17 @@ def test_local_runs_share_the_gpus_evenly(monkeypatch, tmp_path):
     launcher.start(a_run("e"), tmp_path / "log")  # In the place of the one that has ended.
     assert seen[-1] == "5"
     assert LocalLauncher([]).slots == 32
+
+
+def test_runs_are_killed_without_the_signals_name(monkeypatch):
+    """Windows does not name SIGKILL; no test runs there."""
+    code, said = -int(signal.SIGKILL), []
+    monkeypatch.delattr(signal, "SIGKILL")
+    launcher = LocalLauncher([])
+    process = SimpleNamespace(
+        kill=lambda: said.append("kill"), wait=lambda: said.append("wait"), stdin=None
+    )
+    launcher._running["run"] = None, process
+    launcher.close()
+    assert said == ["kill", "wait"]
+    assert runpy.run_module("giril_rl.experiments.study.launchers")["KILLED"] == code

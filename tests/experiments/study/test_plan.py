@@ -8,7 +8,7 @@ import pytest
 
 from giril_rl.cli.command_line import main
 from giril_rl.config.compose import groups
-from giril_rl.config.recipe_files import find
+from giril_rl.config.recipes import find
 from giril_rl.errors import UserError
 from giril_rl.experiments.study.plan import Planner
 from giril_rl.experiments.study.spec import find_study, read_spec, shipped_studies
@@ -111,15 +111,15 @@ def test_a_study_that_is_cut_short_has_every_row_of_the_first_seed(study):
         ),
         (
             "groups: [{label: a, recipe: fake.py, seed: [0, -1]}]",
-            "mine, group 'a': seed=-1 must be at least 0.",
+            "mine, group 'a': seed=-1 must be greater than or equal to 0.",
         ),
         (
             "groups: [{label: a, recipe: fake.py, ppo.clip: 0}]",
-            "mine, group 'a': ppo.clip=0.0 must be above 0.",
+            "mine, group 'a': ppo.clip=0.0 must be greater than 0.",
         ),
         (
             "groups: [{label: a, recipe: fake.py, widths: [2, 0]}]",
-            "mine, group 'a': widths=[2,0]: each entry must be at least 1.",
+            "mine, group 'a': widths[1]=0 must be greater than or equal to 1.",
         ),
         (
             "groups: [{label: a, recipe: fake.py, task: pong}]",
@@ -237,7 +237,7 @@ def test_shipped_studies_hold_what_they_say():
     assert fits == [10] * 6 * 3
     # 2 experts; on 2 games with 2 seeds: GIRIL in 2 profiles, CDIL, 2 adversarial, BC, 6 controls.
     assert counts["atari-small"] == 2 + 2 * 2 * (2 + 1 + 2 + 1 + 6)
-    pages = Path(__file__).parents[2] / "docs"
+    pages = Path(__file__).parents[3] / "docs"
     for name, count in counts.items():
         row = rf"^\| `{name}` \|.*"
         (one,) = re.findall(row, (pages / "studies.md").read_text(), re.MULTILINE)

@@ -2,12 +2,16 @@ import pytest
 import yaml
 
 from giril_rl.config.compose import resolved
-from giril_rl.config.leaves import flat, leaves
-from giril_rl.config.recipe_config import config_class
-from giril_rl.config.recipe_files import find, shipped, shipped_conf
-from giril_rl.config.schema import ExpertRunConfig, PPOConfig, RunConfig, TaskConfig
-from giril_rl.config.task_defaults import apply_task_defaults, task_defaults
-from giril_rl.methods import ControlRunConfig
+from giril_rl.config.knobs import flat, knobs
+from giril_rl.config.recipes import config_class, find, shipped, shipped_conf
+from giril_rl.config.schema import (
+    ControlRunConfig,
+    ExpertRunConfig,
+    PPOConfig,
+    RunConfig,
+    TaskConfig,
+)
+from giril_rl.config.tasks import apply_task_defaults, task_defaults
 
 PONG, PENDULUM = "ALE/Pong-v5", "Pendulum-v1"
 RECIPES = [recipe.name for recipe in shipped()]
@@ -25,7 +29,7 @@ def test_only_atari_has_settings_of_its_own():
 
 
 def test_every_key_belongs_to_a_recipe():
-    known = {leaf.key for name in RECIPES for leaf in leaves(config_class(find(name)))}
+    known = {knob.key for name in RECIPES for knob in knobs(config_class(find(name)))}
     assert task_defaults(PONG).keys() <= known
 
 

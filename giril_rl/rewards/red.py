@@ -1,0 +1,361 @@
+"""RED: random expert distillation, a reward for staying where the demonstration has been.
+
+``r = exp(-sigma * ||f(s, a) - g(s, a)||^2)`` (Wang et al., ICML 2019): a network f is trained to
+predict a random network g on the demonstration, and predicts it badly elsewhere.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import cast
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.utils import NestedKey
+from torch import Tensor, nn
+from torchrl.data import TensorSpec
+from torchrl.envs import EnvBase
+
+from giril_rl.config.schema import knob
+from giril_rl.errors import UserError
+from giril_rl.networks.pixels import FEATURES, PixelFeatures
+from giril_rl.networks.vectors import mlp
+from giril_rl.rewards.actions import ActionEncoder
+from giril_rl.rewards.fitting import Reduction, TransitionLoss
+from giril_rl.rewards.method import GREY, Method, register
+from giril_rl.rewards.scaler import ObservationScaler, PixelScaler, ScalingRule
+from giril_rl.rewards.transitions import (
+    REWARD_KEYS,
+    TRANSITION_KEYS,
+    TransitionReward,
+    check_transitions,
+    observation_shape,
+)
+from giril_rl.runs.pretrained import Pretrained, remembered
+from giril_rl.runs.randomness import seeded, stream_seed
+
+
+@dataclass
+class DistillationConfig:
+    """RED's two networks and the reward made of them."""
+
+    sigma: float | None = knob(
+        None, "sharpness; null takes the one of `demo_reward`", low=0, low_open=True
+    )
+    demo_reward: float = knob(
+        0.9,
+        "mean reward that sigma gives the demonstration",
+        low=0,
+        high=1,
+        low_open=True,
+        high_open=True,
+    )
+    normalise: str = knob(
+        "standardise",
+        "observation rule of the reward model",
+        choices=("demo_range", "standardise", "raw", "pixels"),
+    )
+    clamp: bool = knob(True, "clamp observations to [-1, 1], those of normalise=raw too")
+    hidden: list[int] = knob([100, 100], "hidden layers of both networks (tanh)", low=1)
+    features: int = knob(100, "size of both networks' output", low=1)
+    seed: int | None = knob(None, "seed of the reward model; null takes the run's seed", low=0)
+
+
+def distillation_reward(predicted: Tensor, target: Tensor, sigma: Tensor | float) -> Tensor:
+    """``exp(-sigma * ||f - g||^2)``, summed over the last dimension (Wang et al., 2019).
+
+    Args:
+        predicted: the trained network's output f, ``(*batch, features)``.
+        target: the random network's output g, of the same shape.
+        sigma: sharpness, above 0.
+
+    Examples:
+        >>> f, g = torch.tensor([[1.0, 0.0], [1.0, 2.0]]), torch.tensor([[1.0, 0.0], [0.0, 1.0]])
+        >>> distillation_reward(f, g, 0.5)
+        tensor([1.0000, 0.3679])
+    """
+    return (-sigma * (predicted - target).square().sum(-1)).exp()
+
+
+class DistillationReward(Pretrained, TransitionReward):
+    """RED's reward, in (0, 1], of observation and action; the next observation is not used.
+
+    Train it with :class:`DistillationLoss`, after ``reward.scaler.fit(observations)``, then choose
+    sigma with :meth:`calibrate`.
+
+    Args:
+        predictor: f, called with scaled observations and encoded actions.
+        target: g, of the same kind; it keeps its random weights.
+        scaler: applied to observations.
+        actions: encodes actions.
+        sigma: sharpness.
+        in_keys: keys of observation, action and next observation.
+        out_keys: where the reward is written, one key.
+
+    Raises:
+        UserError: for another number of keys, or entries that are missing or of a wrong shape.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> from torchrl.data import Bounded
+        >>> reward = DistillationReward.for_vectors(2, Bounded(-1, 1, shape=(1,)), normalise="raw")
+        >>> s, a = torch.zeros(4, 2), torch.zeros(4, 1)
+        >>> batch = TensorDict({"observation": s, "action": a, "next": {"observation": s}}, [4])
+        >>> reward(batch)["next", "intrinsic_reward"].shape
+        torch.Size([4, 1])
+    """
+
+    sigma: Tensor
+
+    def __init__(
+        self,
+        predictor: nn.Module,
+        target: nn.Module,
+        *,
+        scaler: ObservationScaler | PixelScaler,
+        actions: ActionEncoder,
+        sigma: float = 1.0,
+        in_keys: Sequence[NestedKey] = TRANSITION_KEYS,
+        out_keys: Sequence[NestedKey] = REWARD_KEYS,
+    ) -> None:
+        roles = "observation", "action", "next observation"
+        super().__init__("a distillation reward", roles, in_keys, out_keys)
+        self.predictor = predictor
+        self.target = target.requires_grad_(False)
+        self.scaler = scaler
+        self.actions = actions
+        self.register_buffer("sigma", torch.tensor(float(sigma)))
+
+    @classmethod
+    @remembered
+    def for_vectors(
+        cls,
+        observation_dim: int,
+        action_spec: TensorSpec,
+        *,
+        hidden: Sequence[int] = (100, 100),
+        features: int = 100,
+        sigma: float = 1.0,
+        normalise: ScalingRule = "standardise",
+        clamp: bool = True,
+        seed: int = 0,
+        in_keys: Sequence[NestedKey] = TRANSITION_KEYS,
+        out_keys: Sequence[NestedKey] = REWARD_KEYS,
+    ) -> DistillationReward:
+        """Two multilayer perceptrons, initialised from ``seed`` alone.
+
+        Args:
+            observation_dim: size of the observation.
+            action_spec: the environment's action spec.
+            hidden: hidden layers (tanh) of both networks.
+            features: size of their output.
+            sigma: sharpness.
+            normalise: the scaler's rule.
+            clamp: clamp the scaled observations to [-1, 1].
+            seed: seed of the weights. The global random state stays as it is.
+            in_keys: see the class.
+            out_keys: see the class.
+
+        Raises:
+            UserError: for an unknown rule or kind of action.
+        """
+        actions = ActionEncoder(action_spec)
+        with seeded(seed):
+            predictor = mlp(observation_dim + actions.size, features, hidden)
+            target = mlp(observation_dim + actions.size, features, hidden)
+        return cls(
+            predictor,
+            target,
+            scaler=ObservationScaler(observation_dim, rule=normalise, clamp=clamp),
+            actions=actions,
+            sigma=sigma,
+            in_keys=in_keys,
+            out_keys=out_keys,
+        )
+
+    @classmethod
+    @remembered
+    def for_pixels(
+        cls,
+        action_spec: TensorSpec,
+        *,
+        channels: int = 4,
+        features: int = 100,
+        sigma: float = 1.0,
+        seed: int = 0,
+        in_keys: Sequence[NestedKey] = TRANSITION_KEYS,
+        out_keys: Sequence[NestedKey] = REWARD_KEYS,
+    ) -> DistillationReward:
+        """ICM's convolutions and a linear layer for ``channels`` frames; see `for_vectors`."""
+        actions = ActionEncoder(action_spec)
+        with seeded(seed):
+            predictor = _PixelNetwork(channels, actions.size, features)
+            target = _PixelNetwork(channels, actions.size, features)
+        return cls(
+            predictor,
+            target,
+            scaler=PixelScaler(),
+            actions=actions,
+            sigma=sigma,
+            in_keys=in_keys,
+            out_keys=out_keys,
+        )
+
+    def outputs(self, observation: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
+        """``f(s, a)`` and ``g(s, a)``, each ``(*batch, features)``."""
+        inputs = self.scaler(observation), self.actions(action)
+        return self.predictor(*inputs), self.target(*inputs)
+
+    def value(self, *transitions: Tensor) -> Tensor:
+        """The reward of each transition."""
+        observation, action, _ = transitions
+        return distillation_reward(*self.outputs(observation, action), self.sigma)
+
+    @torch.no_grad()
+    def calibrate(self, pairs: TensorDictBase, demo_reward: float = 0.9) -> None:
+        """Chooses sigma so that the mean reward of ``pairs`` is ``demo_reward``.
+
+        Args:
+            pairs: transitions, batch ``(n,)``; the demonstration's.
+            demo_reward: their mean reward, in (0, 1).
+
+        Raises:
+            UserError: if f predicts g without any error on ``pairs``, or ``demo_reward`` is outside
+                (0, 1).
+
+        Examples:
+            >>> from tensordict import TensorDict
+            >>> from torchrl.data import Bounded
+            >>> reward = DistillationReward.for_vectors(2, Bounded(-1, 1, shape=(1,)))
+            >>> s, a = torch.randn(9, 2), torch.zeros(9, 1)
+            >>> _ = reward.scaler.fit(s)
+            >>> pairs = TensorDict({"observation": s, "action": a, "next": {"observation": s}}, [9])
+            >>> reward.calibrate(pairs, demo_reward=0.8)
+            >>> reward(pairs)["next", "intrinsic_reward"].mean().detach()
+            tensor(0.8000)
+        """
+        if not 0 < demo_reward < 1:
+            raise UserError(f"demo_reward={demo_reward} is outside (0, 1): give one such as 0.9.")
+        device = self.sigma.device
+        entries = [pairs.get(key).to(device) for key in self.in_keys]
+        self.sigma.fill_(1.0)
+        error = -self.values(*entries).double().log()
+        if not (error.isfinite().all() and error.max() > 0):
+            raise UserError(
+                "RED's network predicts the demonstration without any error, or without bound: set "
+                "reward.sigma."
+            )
+        # The mean reward falls as sigma grows: bisection in its logarithm.
+        low, high = -60.0, 60.0
+        for _ in range(100):
+            middle = (low + high) / 2
+            reward = (-math.exp(middle) * error).exp().mean().item()
+            low, high = (middle, high) if reward > demo_reward else (low, middle)
+        self.sigma.fill_(math.exp((low + high) / 2))
+
+
+class _PixelNetwork(nn.Module):
+    def __init__(self, channels: int, actions: int, features: int) -> None:
+        super().__init__()
+        self.body = PixelFeatures(channels)
+        self.head = nn.Linear(FEATURES + actions, features)
+
+    def forward(self, observation: Tensor, encoding: Tensor) -> Tensor:
+        return self.head(torch.cat([self.body(observation), encoding], -1))
+
+
+class DistillationLoss(TransitionLoss):
+    """``||f(s, a) - g(s, a)||^2``, the error of f on the demonstration (Wang et al., 2019).
+
+    Args:
+        reward: the module to train; g's parameters are not trained.
+        reduction: ``"mean"``, ``"sum"`` or ``"none"`` over transitions.
+        functional: see :class:`~giril_rl.rewards.TransitionLoss`.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> from torchrl.data import Bounded
+        >>> reward = DistillationReward.for_vectors(2, Bounded(-1, 1, shape=(1,)), normalise="raw")
+        >>> s, a = torch.zeros(4, 2), torch.zeros(4, 1)
+        >>> batch = TensorDict({"observation": s, "action": a, "next": {"observation": s}}, [4])
+        >>> list(DistillationLoss(reward)(batch).keys())
+        ['loss_distillation']
+    """
+
+    reward: DistillationReward
+
+    def __init__(
+        self,
+        reward: DistillationReward,
+        *,
+        reduction: Reduction = "mean",
+        functional: bool = False,
+    ) -> None:
+        super().__init__(reward, reduction=reduction, functional=functional)
+
+    @property
+    def out_keys(self) -> list[NestedKey]:
+        """The name of the term."""
+        return ["loss_distillation"]
+
+    def terms(
+        self, observation: Tensor, action: Tensor, next_observation: Tensor
+    ) -> tuple[Tensor, ...]:
+        """The squared error of each transition."""
+        reward = self.reward
+        check_transitions(reward.scaler, reward.actions, observation, action, next_observation)
+        predicted, target = reward.outputs(observation, action)
+        return ((predicted - target).square().sum(-1),)
+
+
+def red_reward(
+    settings: DistillationConfig, env: EnvBase, pairs: TensorDictBase, *, seed: int
+) -> DistillationReward:
+    """RED's reward, untrained, its scaler fitted to ``pairs``.
+
+    Args:
+        settings: its settings; ``seed`` is the caller's to resolve.
+        env: the environment, for its specs.
+        pairs: the demonstrated transitions to learn from.
+        seed: seed of the weights. The global random state stays as it is.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> from torchrl.envs import GymEnv
+        >>> pairs = TensorDict({"observation": torch.rand(9, 4)}, [9])
+        >>> red_reward(DistillationConfig(), GymEnv("CartPole-v1"), pairs, seed=0).scaler
+        ObservationScaler(4, rule='standardise', clamp=True)
+    """
+    frames, size = observation_shape(env)
+    seed, sigma = stream_seed("reward", seed), settings.sigma or 1.0
+    if frames:
+        reward = DistillationReward.for_pixels(
+            env.action_spec, channels=frames, features=settings.features, sigma=sigma, seed=seed
+        )
+    else:
+        reward = DistillationReward.for_vectors(
+            size,
+            env.action_spec,
+            hidden=settings.hidden,
+            features=settings.features,
+            sigma=sigma,
+            normalise=cast(ScalingRule, settings.normalise),
+            clamp=settings.clamp,
+            seed=seed,
+        )
+    reward.scaler.fit(pairs.get("observation"))
+    return reward
+
+
+register(
+    Method(
+        "red",
+        "RED",
+        GREY,
+        settings=DistillationConfig,
+        build=red_reward,
+        loss=lambda reward, settings: DistillationLoss(reward),
+    )
+)
