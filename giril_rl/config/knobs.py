@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Optional, get_args, get_type_hints
@@ -29,7 +29,7 @@ def knob(
     default: Any,
     help: str,
     *,
-    choices: Sequence[str] | None = None,
+    choices: Sequence[str] | Callable[[], Collection[str]] | None = None,
     low: float | None = None,
     high: float | None = None,
     low_open: bool = False,
@@ -40,7 +40,7 @@ def knob(
     Args:
         default: the value used unless another is given; ``MISSING`` makes the knob mandatory.
         help: one line, shown by ``--help``.
-        choices: the only texts allowed.
+        choices: the only texts allowed, or a function that returns them when they are needed.
         low: smallest number allowed; in a list, of each entry.
         high: largest number allowed; in a list, of each entry.
         low_open: ``low`` itself is not allowed.
@@ -57,7 +57,7 @@ def knob(
     bounds = {"gt" if low_open else "ge": low, "lt" if high_open else "le": high}
     metadata = {
         "help": help,
-        "choices": tuple(choices) if choices else None,
+        "choices": choices if callable(choices) else tuple(choices or ()) or None,
         "bounds": {name: bound for name, bound in bounds.items() if bound is not None},
     }
     if isinstance(default, list):
@@ -85,6 +85,12 @@ class Knob:
         return self.metadata.get("help", "")
 
     @property
+    def choices(self) -> tuple[str, ...] | None:
+        """The only texts allowed, None where any is."""
+        choices = self.metadata.get("choices")
+        return tuple(choices()) if callable(choices) else choices
+
+    @property
     def line(self) -> str:
         """The line that ``--help`` shows: the help and the choices.
 
@@ -92,7 +98,7 @@ class Knob:
             >>> Knob("form", str, {"help": "form of the reward", "choices": ("a", "b")}).line
             'form of the reward {a, b}'
         """
-        choices = self.metadata.get("choices")
+        choices = self.choices
         return self.help + (f" {{{', '.join(choices)}}}" if choices else "")
 
     @property
@@ -161,8 +167,8 @@ class Knob:
 
         whole: dict[str, Any] = {"ge": -MOST, "le": MOST}
         bounds: dict[str, Any] = self.metadata.get("bounds") or {}
-        if self.metadata.get("choices"):
-            return Literal[self.metadata["choices"]]
+        if self.choices:
+            return Literal[self.choices]
         if self.is_list and kind is self._kind:
             return list[self._bounded(get_args(kind)[0])]  # type: ignore[misc]
         if kind is int:

@@ -15,6 +15,7 @@ import shutil
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, is_dataclass
+from importlib import import_module
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -141,7 +142,8 @@ def config_class(recipe: Recipe) -> type[Any]:
     """A recipe's ``Config``, for help and checks.
 
     A recipe imports TorchRL at its top, which takes seconds. Only the statements that ``Config``
-    needs are run here; where they fail on their own, the whole file is loaded.
+    needs are run here: the recipe's, and those of the modules of this package that define its
+    parts. Where they fail on their own, the whole file is loaded.
 
     Raises:
         UserError: as :meth:`Recipe.load`.
@@ -150,24 +152,56 @@ def config_class(recipe: Recipe) -> type[Any]:
         >>> config_class(find("giril")).__name__
         'Config'
     """
-    module = ModuleType(f"giril_recipe_config_{recipe.name}")
-    sys.modules[module.__name__] = module
     if recipe.docstring:
-        body = _statements_for("Config", recipe.tree().body)
         if not recipe.is_shipped:
             search_in(*recipe.folders)
-        code = compile(ast.Module(body, []), str(recipe.path), "exec", dont_inherit=True)
         try:
-            exec(code, module.__dict__)
-            return recipe.checked(module.Config)
+            return recipe.checked(_defined("Config", recipe.path, recipe.name))
         except Exception:
             # The whole file either works or says what is wrong with it.
             pass
     return recipe.load().Config
 
 
-def _statements_for(name: str, body: list[ast.stmt]) -> list[ast.stmt]:
-    """The top-level statements that bind ``name``, and what those refer to."""
+def _defined(name: str, path: Path, module_name: str) -> Any:
+    """What ``name`` is in a file of which only the statements that it needs are run."""
+    module = ModuleType(f"giril_config_of_{module_name}.{name}")
+    # Dataclasses look up their module by name when their annotations are read.
+    sys.modules[module.__name__] = module
+    run: list[ast.stmt] = []
+    statements, names = _needed_for(name, ast.parse(path.read_text("utf-8")).body)
+    for statement in statements:
+        if isinstance(statement, ast.ImportFrom) and _is_heavy(statement.module or ""):
+            for alias in statement.names:
+                if (bound := alias.asname or alias.name) in names:
+                    setattr(module, bound, _imported(alias.name, statement.module or ""))
+        else:
+            run.append(statement)
+    exec(compile(ast.Module(run, []), str(path), "exec", dont_inherit=True), module.__dict__)
+    return getattr(module, name)
+
+
+def _is_heavy(module: str) -> bool:
+    """Whether a module of this package may import TorchRL, and is not imported yet."""
+    light = "giril_rl.config", "giril_rl.errors"
+    ours = module.startswith("giril_rl.") and not module.startswith(light)
+    return ours and module not in sys.modules
+
+
+def _imported(name: str, module: str) -> Any:
+    """A class of settings of a heavy module, by its own statements; of all else, the import."""
+    path = Path(__file__).parents[1].joinpath(*module.split(".")[1:])
+    path = path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
+    for statement in ast.parse(path.read_text("utf-8")).body:
+        if name in _bound(statement) and isinstance(statement, ast.ClassDef):
+            return _defined(name, path, module)
+        if name in _bound(statement) and isinstance(statement, ast.ImportFrom):
+            return _imported(name, statement.module or "")
+    return getattr(import_module(module), name)
+
+
+def _needed_for(name: str, body: list[ast.stmt]) -> tuple[list[ast.stmt], set[str]]:
+    """The top-level statements that ``name`` needs, in their order, and all names in them."""
     needed, kept = {name, "annotations"}, set[int]()
     while True:
         new = [
@@ -176,7 +210,7 @@ def _statements_for(name: str, body: list[ast.stmt]) -> list[ast.stmt]:
             if index not in kept and needed & set(_bound(statement))
         ]
         if not new:
-            return [body[index] for index in sorted(kept)]
+            return [body[index] for index in sorted(kept)], needed
         kept.update(new)
         for index in new:
             needed |= {node.id for node in ast.walk(body[index]) if isinstance(node, ast.Name)}

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from importlib import import_module
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -11,7 +13,6 @@ from tensordict.nn import TensorDictModuleBase
 from giril_rl.config.schema import AveragedRunConfig, FitConfig, knob
 from giril_rl.demos import Demonstration, holdout, subsample
 from giril_rl.envs import BatchedEnv
-from giril_rl.methods.registry import controls
 from giril_rl.rewards import CuriosityConfig, GenerativeConfig
 from giril_rl.rewards.method import Method
 from giril_rl.runs.metrics import METRICS, read_metrics
@@ -26,6 +27,11 @@ from giril_rl.training import (
 from giril_rl.transforms.intrinsic import device_of
 
 
+def _controls() -> dict[str, Any]:
+    """The registry's controls; it imports all methods, for which help need not wait."""
+    return import_module("giril_rl.methods.registry").controls()
+
+
 @dataclass
 class ControlRunConfig(AveragedRunConfig):
     """Settings of the controls' recipe; those that the chosen reward does not use are not read."""
@@ -34,7 +40,7 @@ class ControlRunConfig(AveragedRunConfig):
         "constant",
         "the reward that stands in for a learned one; random: no reward, a random policy's score; "
         "held_action: no reward, the score of one action all the time, the best one",
-        choices=list(controls()),
+        choices=_controls,
     )
     held_episodes: int = knob(20, "held_action: episodes that choose the action", low=1)
     giril: GenerativeConfig = field(default_factory=GenerativeConfig)
@@ -42,9 +48,9 @@ class ControlRunConfig(AveragedRunConfig):
     fit: FitConfig = field(default_factory=FitConfig)
 
     @property
-    def method(self) -> Method:
-        """The registry's entry of the control."""
-        return controls()[self.reward]
+    def method(self) -> Any:
+        """The registry's entry of the control, a :class:`~giril_rl.rewards.method.Method`."""
+        return _controls()[self.reward]
 
     @property
     def needs_demonstration(self) -> bool:
@@ -103,7 +109,7 @@ def control_reward(
     Raises:
         UserError: if the fitted reward is the same for all transitions and noise should match it.
     """
-    method = cfg.method
+    method: Method = cfg.method
     assert method.build is not None
     settings = next((p for p in (cfg.giril, cfg.icm) if type(p) is method.settings), None)
     seed = cfg.seed if settings is None or settings.seed is None else settings.seed

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -33,9 +33,9 @@ from giril_rl.rewards.discriminator import (
 from giril_rl.rewards.generative import gaussian_kl
 from giril_rl.rewards.method import PINK, Method, register
 from giril_rl.rewards.scaler import PixelScaler
-from giril_rl.rewards.transitions import PAIR_KEYS, REWARD_KEYS, check_output, observation_shape
+from giril_rl.rewards.transitions import PAIR_KEYS, REWARD_KEYS, check_output, reward_for
 from giril_rl.runs.pretrained import remembered
-from giril_rl.runs.randomness import seeded, stream_seed
+from giril_rl.runs.randomness import seeded
 
 
 @dataclass
@@ -243,24 +243,10 @@ def bottleneck_reward(
     settings: BottleneckConfig, env: EnvBase, pairs: TensorDictBase, *, seed: int
 ) -> BottleneckReward:
     """VAIL's reward; arguments as :func:`~giril_rl.rewards.discriminator_reward` has them."""
-    form = cast(RewardForm, settings.form)
-    frames, size = observation_shape(env)
-    seed = stream_seed("reward", seed)
-    if frames:
-        reward = BottleneckReward.for_pixels(
-            env.action_spec, channels=frames, form=form, latent=settings.latent, seed=seed
-        )
-    else:
-        reward = BottleneckReward.for_vectors(
-            size,
-            env.action_spec,
-            hidden=settings.hidden,
-            form=form,
-            normalise=cast(DiscriminatorScaling, settings.normalise),
-            clamp=settings.clamp,
-            latent=settings.latent,
-            seed=seed,
-        )
+    own = "hidden normalise clamp"
+    reward = reward_for(
+        env, BottleneckReward, settings, seed=seed, of_all="form latent", of_vectors=own
+    )
     reward.fit_scaler(pairs.get("observation"))
     return reward
 

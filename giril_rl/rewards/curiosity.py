@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, cast, get_args
+from typing import Literal, get_args
 
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
@@ -31,10 +31,10 @@ from giril_rl.rewards.transitions import (
     TransitionReward,
     check_output,
     check_transitions,
-    observation_shape,
+    reward_for,
 )
 from giril_rl.runs.pretrained import Pretrained, remembered
-from giril_rl.runs.randomness import seeded, stream_seed
+from giril_rl.runs.randomness import seeded
 
 FeatureTraining = Literal["inverse", "both", "none"]
 
@@ -335,23 +335,8 @@ def curiosity_reward(
         >>> curiosity_reward(CuriosityConfig(), GymEnv("CartPole-v1"), pairs, seed=0).scaler
         ObservationScaler(4, rule='standardise', clamp=True)
     """
-    frames, size = observation_shape(env)
-    seed = stream_seed("reward", seed)
-    if frames:
-        reward = CuriosityReward.for_pixels(
-            env.action_spec, channels=frames, scale=settings.scale, seed=seed
-        )
-    else:
-        reward = CuriosityReward.for_vectors(
-            size,
-            env.action_spec,
-            hidden=settings.hidden,
-            model_hidden=settings.model_hidden,
-            scale=settings.scale,
-            normalise=cast(ScalingRule, settings.normalise),
-            clamp=settings.clamp,
-            seed=seed,
-        )
+    own = "hidden model_hidden normalise clamp"
+    reward = reward_for(env, CuriosityReward, settings, seed=seed, of_all="scale", of_vectors=own)
     reward.scaler.fit(pairs.get("observation"))
     return reward
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal, cast, get_args
+from typing import Literal, get_args
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -41,11 +41,11 @@ from giril_rl.rewards.transitions import (
     TransitionReward,
     check_actions,
     check_output,
-    observation_shape,
     read,
+    reward_for,
 )
 from giril_rl.runs.pretrained import Pretrained, remembered
-from giril_rl.runs.randomness import seeded, stream_seed
+from giril_rl.runs.randomness import seeded
 
 DiscriminatorScaling = Literal["running", "demo_range", "standardise", "raw"]
 
@@ -293,11 +293,8 @@ class DiscriminatorLoss(RewardLoss):
     class _AcceptedKeys:
         """The keys that :meth:`set_keys` changes; their defaults follow the reward's ``in_keys``.
 
-        Attributes:
-            expert_observation: raw observations of the expert ``(*n, d)``.
-            expert_action: its actions, as the environment takes them.
-            policy_observation: raw observations of the policy ``(*m, d)``.
-            policy_action: its actions.
+        Observations are raw, ``(*n, d)`` of the expert and ``(*m, d)`` of the policy. Actions are
+        as the environment takes them.
         """
 
         expert_observation: NestedKey = ("expert", "observation")
@@ -403,23 +400,10 @@ def discriminator_reward(
         pairs: the demonstrated transitions to learn from.
         seed: seed of the weights. The global random state stays as it is.
     """
-    form = cast(RewardForm, settings.form)
-    frames, size = observation_shape(env)
-    seed = stream_seed("reward", seed)
-    if frames:
-        reward = DiscriminatorReward.for_pixels(
-            env.action_spec, channels=frames, form=form, seed=seed
-        )
-    else:
-        reward = DiscriminatorReward.for_vectors(
-            size,
-            env.action_spec,
-            hidden=settings.hidden,
-            form=form,
-            normalise=cast(DiscriminatorScaling, settings.normalise),
-            clamp=settings.clamp,
-            seed=seed,
-        )
+    own = "hidden normalise clamp"
+    reward = reward_for(
+        env, DiscriminatorReward, settings, seed=seed, of_all="form", of_vectors=own
+    )
     reward.fit_scaler(pairs.get("observation"))
     return reward
 

@@ -87,6 +87,26 @@ def factored_error(
     return errors.div_(HALF_RANGE**2).reshape(batch)
 
 
+def coded_error(
+    decoder: PixelDecoder,
+    encoding: Tensor,
+    observation: Tensor,
+    next_observation: Tensor,
+    *,
+    clamp: bool,
+) -> Tensor:
+    """:func:`factored_error` for encodings ``(*batch, actions)`` that differ by transition."""
+    batch = encoding.shape[:-1]
+    return factored_error(
+        decoder.code_part(encoding.reshape(-1, encoding.shape[-1])),
+        decoder.state_weight,
+        torch.arange(batch.numel(), device=encoding.device).reshape(batch),
+        observation,
+        next_observation,
+        clamp=clamp,
+    )
+
+
 def _raw_table(table: Tensor, weight: Tensor) -> Tensor:
     """The table for states in 0..255 and a prediction on the same scale.
 

@@ -24,14 +24,7 @@ Reduction = Literal["mean", "sum", "none"]
 
 
 class RewardLoss(LossModule):
-    """A loss that trains a reward module.
-
-    Args:
-        reward: the module to train; its parameters are this loss's parameters.
-        functional: keep parameters and buffers apart from the module, under ``reward_params``, as
-            TorchRL's own losses do. By default they stay in the module: the loss's ``state_dict``
-            then has the module's names, and its noise generator's state.
-    """
+    """A loss that trains a reward module; its arguments are those of :class:`TransitionLoss`."""
 
     reward: TensorDictModuleBase
     reward_params: TensorDictParams
@@ -89,13 +82,7 @@ class TransitionLoss(RewardLoss):
 
     @dataclass
     class _AcceptedKeys:
-        """The keys that :meth:`set_keys` changes; their defaults are the reward's ``in_keys``.
-
-        Attributes:
-            observation: observation ``(*batch, d)``.
-            action: action, as the environment takes it.
-            next_observation: the true next observation.
-        """
+        """The keys that :meth:`set_keys` changes; their defaults are the reward's ``in_keys``."""
 
         observation: NestedKey = "observation"
         action: NestedKey = "action"

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, cast, get_args
+from typing import Literal, cast, get_args
 
 import torch
 import torch.nn.functional as F
@@ -25,7 +25,13 @@ from giril_rl.networks.pixel_decoder import PixelDecoder
 from giril_rl.networks.pixels import PixelEncoder, PixelPrior
 from giril_rl.networks.vectors import mlp
 from giril_rl.rewards.actions import ActionEncoder
-from giril_rl.rewards.factored import ActionTable, computes_as, factored_error, is_factored
+from giril_rl.rewards.factored import (
+    ActionTable,
+    coded_error,
+    computes_as,
+    factored_error,
+    is_factored,
+)
 from giril_rl.rewards.fitting import Reduction, TransitionLoss
 from giril_rl.rewards.method import BLUE, Method, register
 from giril_rl.rewards.scaler import ObservationScaler, PixelScaler, ScalingRule
@@ -35,10 +41,10 @@ from giril_rl.rewards.transitions import (
     TransitionReward,
     check_output,
     check_transitions,
-    observation_shape,
+    reward_for,
 )
 from giril_rl.runs.pretrained import Pretrained, remembered
-from giril_rl.runs.randomness import seeded, stream_seed
+from giril_rl.runs.randomness import seeded
 
 Prior = Literal["standard", "conditional"]
 
@@ -238,7 +244,7 @@ class GenerativeReward(Pretrained, TransitionReward):
             observation_dim: size of the observation.
             action_spec: the environment's action spec; z has its size.
             hidden: hidden layers (tanh) of encoder, decoder and conditional prior.
-            beta: as the class has it, as for ``scale``, ``in_keys`` and ``out_keys``.
+            beta: weight of the true action, in (0, 1].
             scale: lambda.
             prior: ``"standard"`` for N(0, I), as the released code has it, or ``"conditional"``
                 for the p(z | s) of eq. 1.
@@ -344,23 +350,13 @@ class GenerativeReward(Pretrained, TransitionReward):
     def values(self, *transitions: Tensor) -> Tensor:
         """Eq. 2 of each transition ``(*batch,)``."""
         observation, action, next_observation = transitions
-        table_serves = self.beta == 1 and self.actions.discrete
-        if (
-            table_serves
-            and is_factored(self.decoder, self.scaler, observation, next_observation)
-            and computes_as(self.actions, ActionEncoder)
-        ):
-            # There are only as many images as actions, and the decoder runs once for each.
-            error = factored_error(
-                *self._table(cast(PixelDecoder, self.decoder)),
-                self.actions.target(action),
-                observation,
-                next_observation,
-                clamp=self.scaler.clamp,
-            )
-        else:
-            error = super().values(*transitions)
-        return self.scale * error
+        factored = is_factored(self.decoder, self.scaler, observation, next_observation)
+        if not factored or self.beta < 1 or not self._is_one_hot():
+            return self.scale * super().values(*transitions)
+        # There are only as many images as actions, and the decoder runs once for each.
+        parts = *self._table(cast(PixelDecoder, self.decoder)), self.actions.target(action)
+        clamp = self.scaler.clamp
+        return self.scale * factored_error(*parts, observation, next_observation, clamp=clamp)
 
     def value(self, *transitions: Tensor) -> Tensor:
         """``||s_hat - s'||^2``, by the decoder's two parts where that is possible."""
@@ -369,16 +365,14 @@ class GenerativeReward(Pretrained, TransitionReward):
         if not is_factored(self.decoder, self.scaler, observation, next_observation):
             predicted = self._predict(s, action, s_next)
             return reconstruction_error(predicted, s_next, self.scaler.event_dims)
-        decoder, encoding = cast(PixelDecoder, self.decoder), self._blended(s, action, s_next)
-        batch = encoding.shape[:-1]
-        return factored_error(
-            decoder.code_part(encoding.reshape(-1, encoding.shape[-1])),
-            decoder.state_weight,
-            torch.arange(batch.numel(), device=encoding.device).reshape(batch),
-            observation,
-            next_observation,
-            clamp=self.scaler.clamp,
+        encoding = self._blended(s, action, s_next)
+        states = observation, next_observation
+        return coded_error(
+            cast(PixelDecoder, self.decoder), encoding, *states, clamp=self.scaler.clamp
         )
+
+    def _is_one_hot(self) -> bool:
+        return self.actions.discrete and computes_as(self.actions, ActionEncoder)
 
     def _predict(self, s: Tensor, action: Tensor, s_next: Tensor) -> Tensor:
         predicted = self.decode(self._blended(s, action, s_next), s)
@@ -498,19 +492,10 @@ def generative_reward(
         >>> generative_reward(GenerativeConfig(), GymEnv("CartPole-v1"), pairs, seed=0).scaler
         ObservationScaler(4, rule='standardise', clamp=True)
     """
-    frames, size = observation_shape(env)
-    shared: dict[str, Any] = {
-        "beta": settings.beta,
-        "scale": settings.scale,
-        "prior": settings.prior,
-        "clamp": settings.clamp,
-        "seed": stream_seed("reward", seed),
-    }
-    if frames:
-        reward = GenerativeReward.for_pixels(env.action_spec, channels=frames, **shared)
-    else:
-        own: dict[str, Any] = {"hidden": settings.hidden, "normalise": settings.normalise}
-        reward = GenerativeReward.for_vectors(size, env.action_spec, **own, **shared)
+    every = "beta scale prior clamp"
+    reward = reward_for(
+        env, GenerativeReward, settings, seed=seed, of_all=every, of_vectors="hidden normalise"
+    )
     reward.scaler.fit(pairs.get("observation"))
     return reward
 

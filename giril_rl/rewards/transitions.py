@@ -15,6 +15,7 @@ from torchrl.envs import EnvBase
 from giril_rl.errors import UserError
 from giril_rl.rewards.actions import ActionEncoder
 from giril_rl.rewards.scaler import ObservationScaler, PixelScaler
+from giril_rl.runs.randomness import stream_seed
 
 TRANSITION_KEYS: tuple[NestedKey, ...] = ("observation", "action", ("next", "observation"))
 PAIR_KEYS: tuple[NestedKey, ...] = ("observation", "action")
@@ -94,18 +95,7 @@ class TransitionReward(TensorDictModuleBase):
 
 
 def read(tensordict: TensorDictBase, keys: Sequence[NestedKey]) -> tuple[Tensor, ...]:
-    """The entries under ``keys``, in their order.
-
-    Raises:
-        UserError: if one is missing.
-
-    Examples:
-        >>> from tensordict import TensorDict
-        >>> read(TensorDict({"action": torch.ones(1)}), ["action", ("next", "observation")])
-        Traceback (most recent call last):
-        giril_rl.errors.UserError: the batch has no ('next', 'observation'): give transitions with
-        'action', ('next', 'observation').
-    """
+    """The entries under ``keys``, in their order; refuses a batch that lacks one."""
     entries = tuple(tensordict.get(key, None) for key in keys)
     for key, entry in zip(keys, entries, strict=True):
         if entry is None:
@@ -121,27 +111,13 @@ def check_transitions(
     action: Tensor,
     next_observation: Tensor,
 ) -> None:
-    """:func:`check_states` and :func:`check_actions`; the scaler checks an observation's size.
-
-    Raises:
-        UserError: for shapes that do not belong together, or another encoding of actions.
-    """
+    """:func:`check_states` and :func:`check_actions`; the scaler checks an observation's size."""
     check_states(observation, next_observation)
     check_actions(actions, action, observation, scaler.event_dims)
 
 
 def check_states(observation: Tensor, next_observation: Tensor) -> None:
-    """Refuses a next observation of another shape, which would be broadcast.
-
-    Raises:
-        UserError: if the shapes differ.
-
-    Examples:
-        >>> check_states(torch.zeros(7, 3), torch.zeros(7, 1))
-        Traceback (most recent call last):
-        giril_rl.errors.UserError: next observations have shape (7, 1) where observations have
-        (7, 3): give both the same shape.
-    """
+    """Refuses a next observation of another shape, which would be broadcast."""
     if next_observation.shape != observation.shape:
         raise UserError(
             f"next observations have shape {tuple(next_observation.shape)} where observations have "
@@ -154,22 +130,7 @@ def check_actions(
 ) -> None:
     """Refuses actions that are not one for each observation, as the action spec has them.
 
-    Args:
-        actions: the reward's action encoder.
-        action: actions, as the environment takes them.
-        observation: the observations beside them, ``(*batch, ...)``.
-        event_dims: dimensions of one observation: 1 for vectors, 3 for frames.
-
-    Raises:
-        UserError: for another dtype or shape.
-
-    Examples:
-        >>> from torchrl.data import Categorical
-        >>> column = torch.zeros(7, 1, dtype=torch.int64)
-        >>> check_actions(ActionEncoder(Categorical(3)), column, torch.zeros(7, 2), 1)
-        Traceback (most recent call last):
-        giril_rl.errors.UserError: actions of shape (7, 1) beside observations of shape (7, 2): the
-        reward reads integers of shape (7,). Give those, or build it with these actions' own spec.
+    ``event_dims`` is the number of dimensions of one observation: 1 for vectors, 3 for frames.
     """
     batch = observation.shape[: observation.ndim - event_dims]
     if actions.batch(action) != batch:
@@ -181,21 +142,7 @@ def check_actions(
 
 
 def check_output(what: str, output: Tensor, shape: Sequence[int]) -> None:
-    """Refuses a network's output that would be broadcast to ``shape``.
-
-    Args:
-        what: the network, for the message.
-        output: its output.
-        shape: the shape needed.
-
-    Raises:
-        UserError: for another shape.
-
-    Examples:
-        >>> check_output("the decoder", torch.zeros(7, 1), (7, 3))
-        Traceback (most recent call last):
-        giril_rl.errors.UserError: the decoder gives shape (7, 1) where (7, 3) is needed.
-    """
+    """Refuses a network's output that would be broadcast to ``shape``; ``what`` names it."""
     if output.shape != tuple(shape):
         raise UserError(f"{what} gives shape {tuple(output.shape)} where {tuple(shape)} is needed.")
 
@@ -205,17 +152,8 @@ def per_transition(
 ) -> Tensor:
     """``function(*inputs)``, of frames :data:`PIXELS_AT_ONCE` at a time to bound the memory.
 
-    Args:
-        function: maps tensors of any leading shape to one number for each element of it.
-        inputs: an observation ``(*batch, ...)`` first, then what else belongs to the transitions.
-        event_dims: dimensions of one observation: 1 for vectors, 3 for frames.
-
-    Returns:
-        One number for each transition, ``(*batch,)``.
-
-    Examples:
-        >>> per_transition(lambda x: x.sum(-1), (torch.ones(2, 3, 5),), event_dims=1).shape
-        torch.Size([2, 3])
+    ``function`` maps tensors of any leading shape to one number for each element. The first input
+    is an observation ``(*batch, ...)``, which has ``event_dims`` dimensions of its own.
     """
     batch = inputs[0].shape[: inputs[0].ndim - event_dims]
     if event_dims < 3 or batch.numel() <= PIXELS_AT_ONCE:
@@ -226,12 +164,28 @@ def per_transition(
 
 
 def observation_shape(env: EnvBase) -> tuple[int, int]:
-    """Frames in an observation (0 for vectors), and the size of its last dimension.
-
-    Examples:
-        >>> from torchrl.envs import GymEnv
-        >>> observation_shape(GymEnv("CartPole-v1"))
-        (0, 4)
-    """
+    """Frames in an observation (0 for vectors), and the size of its last dimension."""
     spec = env.observation_spec["observation"]
     return (spec.shape[-3] if spec.dtype == torch.uint8 else 0), spec.shape[-1]
+
+
+def reward_for(
+    env: EnvBase, kind: Any, settings: Any, *, seed: int, of_all: str, of_vectors: str
+) -> Any:
+    """``kind.for_pixels`` or ``kind.for_vectors``, as the environment's observations need.
+
+    Args:
+        env: the environment, for its specs.
+        kind: the reward's class.
+        settings: its settings.
+        seed: the reward's seed, of which its random numbers' own seed is made.
+        of_all: names of the settings that both constructors take as arguments.
+        of_vectors: names of those that only ``for_vectors`` takes.
+    """
+    frames, size = observation_shape(env)
+    arguments = {name: getattr(settings, name) for name in of_all.split()}
+    arguments["seed"] = stream_seed("reward", seed)
+    if frames:
+        return kind.for_pixels(env.action_spec, channels=frames, **arguments)
+    arguments |= {name: getattr(settings, name) for name in of_vectors.split()}
+    return kind.for_vectors(size, env.action_spec, **arguments)
