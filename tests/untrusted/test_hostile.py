@@ -169,7 +169,10 @@ CASES = {
     "tag: a study": (lambda: study(f"groups: {CALL}"), "correct it."),
     "tag: a recipe's settings": (lambda: recipe(SETTINGS + f"seed: {CALL}\n"), "is not valid YAML"),
     "tag: a task": (lambda: group(f"name: {CALL}\n"), "is not valid YAML, line 1"),
-    "bomb: a task": (lambda: group(BOMB), "task/mine.yaml cannot be read: its aliases stand"),
+    "bomb: a task": (
+        lambda: group(BOMB),
+        "task/mine.yaml cannot be read as YAML: its aliases stand",
+    ),
     "module: a run's environment": (
         lambda: of("evil_module:Env-v0"),
         "names the module evil_module, and reading a run imports nothing",
