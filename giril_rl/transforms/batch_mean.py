@@ -38,6 +38,8 @@ class BatchMeanReward(RewardTransform):
         [[2.0, 4.0], [2.0, 4.0]]
     """
 
+    needs_all_environments = True
+
     def __init__(self, reward_key: NestedKey = "reward", time_dim: int = -1) -> None:
         super().__init__(reward_key)
         self.time_dim = time_dim
@@ -65,9 +67,3 @@ class BatchMeanReward(RewardTransform):
         if dims:
             mean = reward.mean(dims, keepdim=True)
             next_td.set(self.reward_key, torch.empty_like(reward).copy_(mean))
-
-    def _check_batched_worker_compat(self) -> None:
-        raise UserError(
-            "BatchMeanReward inside a worker sees one environment only: put it outside, "
-            "TransformedEnv(ParallelEnv(...), BatchMeanReward())."
-        )

@@ -12,7 +12,7 @@ from tensordict import TensorDict, TensorDictBase, unravel_key
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
-from torchrl.data import Composite, TensorSpec, Unbounded
+from torchrl.data import Composite
 from torchrl.envs import (
     Compose,
     NextObservationDelta,
@@ -25,7 +25,13 @@ from torchrl.envs import (
 from torchrl.record.recorder import VideoRecorder
 
 from giril_rl.errors import UserError
-from giril_rl.transforms.reward_transform import RewardTransform, copied, find_reward, split_mask
+from giril_rl.transforms.reward_transform import (
+    RewardTransform,
+    copied,
+    find_reward,
+    split_mask,
+    unbounded,
+)
 
 DEFAULT_OUT_KEY: NestedKey = ("next", "intrinsic_reward")
 NORMALISERS = (ObservationNorm, VecNorm, VecNormV2)
@@ -156,7 +162,7 @@ class IntrinsicReward(RewardTransform):
         self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
     ) -> TensorDictBase:
         if self.extrinsic_key is not None:
-            zero = self._unbounded(self.parent.full_reward_spec).zero()
+            zero = unbounded(self._own(self.parent.full_reward_spec)).zero()
             tensordict_reset.set(self.extrinsic_key, zero)
         return tensordict_reset
 
@@ -168,15 +174,10 @@ class IntrinsicReward(RewardTransform):
         self.training = mode
         return self
 
-    def _reset_on_native_autoreset(
-        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
-    ) -> TensorDictBase:
-        return self._reset(tensordict, tensordict_reset)
-
     def transform_reward_spec(self, reward_spec: Composite) -> Composite:
         """The learned reward has the environment's shape and dtype, but no bounds."""
         super().transform_reward_spec(reward_spec)
-        reward_spec[self.reward_key] = self._unbounded(reward_spec)
+        reward_spec[self.reward_key] = unbounded(self._own(reward_spec))
         return reward_spec
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
@@ -189,14 +190,10 @@ class IntrinsicReward(RewardTransform):
                     f"the environment has {self.extrinsic_key!r} already: give another "
                     "extrinsic_key, so that no true reward is lost, or None to keep no more."
                 )
-            observation_spec[self.extrinsic_key] = self._unbounded(rewards)
+            observation_spec[self.extrinsic_key] = unbounded(self._own(rewards))
         if self.container is not None:
             _check_order(self.container, self, self.module.in_keys, there)
         return observation_spec
-
-    def _unbounded(self, reward_spec: Composite) -> TensorSpec:
-        spec = self._own(reward_spec)
-        return Unbounded(shape=spec.shape, dtype=spec.dtype, device=spec.device)
 
 
 def _result_key(module: nn.Module) -> NestedKey:
@@ -276,27 +273,14 @@ def _changes(part: Transform, key: NestedKey) -> bool:
 
 
 def device_of(module: nn.Module) -> torch.device | None:
-    """Where a module's parameters are, or its buffers; None if it has neither.
-
-    Examples:
-        >>> device_of(nn.Linear(1, 1)), device_of(nn.Tanh())
-        (device(type='cpu'), None)
-    """
+    """Where a module's parameters or buffers are; None if it has neither."""
     state = next(chain(module.parameters(), module.buffers()), None)
     return None if state is None else state.device
 
 
 @contextmanager
 def eval_mode(module: nn.Module) -> Iterator[None]:
-    """Puts a module in eval mode, and each part back in its own mode afterwards.
-
-    Examples:
-        >>> with eval_mode(layer := nn.Dropout()):
-        ...     layer.training
-        False
-        >>> layer.training
-        True
-    """
+    """Puts a module in eval mode, and each part back in its own mode afterwards."""
     training = [part for part in module.modules() if part.training]
     if training:
         module.eval()

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import ClassVar
 
 import torch
 from tensordict import TensorDictBase, unravel_key
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.data import Composite, TensorSpec
+from torchrl.data import Composite, TensorSpec, Unbounded
 from torchrl.envs import Transform
 
 from giril_rl.errors import UserError
@@ -20,11 +21,10 @@ class RewardTransform(Transform):
     Args:
         reward_key: the reward, without the ``"next"``.
         out_keys: further keys that are written.
-
-    Examples:
-        >>> RewardTransform("prize").in_keys
-        ['prize']
     """
+
+    needs_all_environments: ClassVar[bool] = False
+    """Whether it refuses to run inside a worker, which sees one environment only."""
 
     def __init__(self, reward_key: NestedKey, out_keys: Sequence[NestedKey] = ()) -> None:
         self.reward_key = unravel_key(reward_key)
@@ -35,6 +35,19 @@ class RewardTransform(Transform):
         """Remembers the shape of one reward, against which each step is checked."""
         self._event = self._own(reward_spec).shape[len(reward_spec.shape) :]
         return reward_spec
+
+    def _reset_on_native_autoreset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        return self._reset(tensordict, tensordict_reset)
+
+    def _check_batched_worker_compat(self) -> None:
+        if self.needs_all_environments:
+            name = type(self).__name__
+            raise UserError(
+                f"{name} inside a worker sees one environment only: put it outside, "
+                f"TransformedEnv(ParallelEnv(...), {name}())."
+            )
 
     def _own(self, reward_spec: Composite) -> TensorSpec:
         keys = list(reward_spec.keys(True, True))
@@ -64,21 +77,7 @@ class RewardTransform(Transform):
 
 
 def copied(tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
-    """A shallow copy of a batch and its ``"next"``, in which entries can be set safely.
-
-    A replay buffer returns its storage itself where all of it is requested.
-
-    Raises:
-        UserError: if there is no ``"next"``.
-
-    Examples:
-        >>> from tensordict import TensorDict
-        >>> batch = TensorDict({"next": {"reward": torch.zeros(2, 1)}}, [2])
-        >>> _, next_td = copied(batch)
-        >>> _ = next_td.set("reward", torch.ones(2, 1))
-        >>> batch["next", "reward"].sum()
-        tensor(0.)
-    """
+    """A shallow copy of a batch and its ``"next"``: setting entries changes no stored data."""
     batch = tensordict.copy()
     next_td = batch.get("next", None)
     if next_td is None:
@@ -87,29 +86,19 @@ def copied(tensordict: TensorDictBase) -> tuple[TensorDictBase, TensorDictBase]:
 
 
 def find_reward(next_td: TensorDictBase, key: NestedKey) -> Tensor | None:
-    """The reward under a key; None if it is missing or not a tensor.
-
-    Examples:
-        >>> from tensordict import TensorDict
-        >>> find_reward(TensorDict({"reward": None}, [2]), "reward")
-    """
+    """The reward under a key; None if it is missing or not a tensor."""
     reward = next_td.get(key, None)
     return reward if isinstance(reward, Tensor) else None
 
 
 def split_mask(batch: TensorDictBase) -> Tensor | None:
-    """The mask of split trajectories, False where they are padded; None where none were split.
-
-    Collectors with ``split_trajs`` or ``trajs_per_batch`` write it, and
-    :func:`torchrl.collectors.utils.split_trajectories`.
-
-    Examples:
-        >>> from tensordict import TensorDict
-        >>> mask = torch.tensor([[True, False]])
-        >>> split_mask(TensorDict({"collector": {"mask": mask}}, [1, 2]))
-        tensor([[ True, False]])
-    """
+    """The mask that collectors write for split trajectories, False where padded; else None."""
     mask = batch.get(("collector", "mask"), None)
     if mask is None and batch.get("traj_ids", None) is not None:
         mask = batch.get("mask", None)
     return mask
+
+
+def unbounded(spec: TensorSpec) -> TensorSpec:
+    """A spec of the same shape, dtype and device without bounds."""
+    return Unbounded(shape=spec.shape, dtype=spec.dtype, device=spec.device)

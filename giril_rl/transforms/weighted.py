@@ -9,11 +9,11 @@ import torch
 from tensordict import TensorDictBase, unravel_key
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.data import Composite, TensorSpec, Unbounded
+from torchrl.data import Composite
 from torchrl.envs import Transform
 
 from giril_rl.errors import UserError
-from giril_rl.transforms.reward_transform import copied, find_reward
+from giril_rl.transforms.reward_transform import copied, find_reward, unbounded
 
 
 class WeightedReward(Transform):
@@ -97,7 +97,7 @@ class WeightedReward(Transform):
     ) -> TensorDictBase:
         rewards = self.parent.full_reward_spec
         for key in self._moved(rewards):
-            tensordict_reset.set(key, _unbounded(rewards[key]).zero())
+            tensordict_reset.set(key, unbounded(rewards[key]).zero())
         return tensordict_reset
 
     def _reset_on_native_autoreset(
@@ -116,7 +116,7 @@ class WeightedReward(Transform):
         for key in (self.reward_key, first):
             spec = reward_spec if key in reward_spec.keys(True, True) else observations
             if key in spec.keys(True, True):
-                total = _unbounded(spec[key])
+                total = unbounded(spec[key])
                 break
         for key in self._moved(reward_spec):
             del reward_spec[key]
@@ -127,13 +127,9 @@ class WeightedReward(Transform):
         """Adds the further rewards that it reads."""
         rewards = self.parent.full_reward_spec
         for key in self._moved(rewards):
-            observation_spec[key] = _unbounded(rewards[key])
+            observation_spec[key] = unbounded(rewards[key])
         return observation_spec
 
     def _moved(self, reward_spec: Composite) -> list[NestedKey]:
         rewards = list(reward_spec.keys(True, True))
         return [key for key in self.weights if key in rewards and key != self.reward_key]
-
-
-def _unbounded(spec: TensorSpec) -> TensorSpec:
-    return Unbounded(shape=spec.shape, dtype=spec.dtype, device=spec.device)
