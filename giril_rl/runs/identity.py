@@ -216,7 +216,7 @@ def sources(recipe: Recipe, modules: Iterable[str]) -> dict[str, str]:
         modules: names of modules; they are not imported, and packages are skipped.
 
     Examples:
-        >>> from giril_rl.config.recipe_files import find
+        >>> from giril_rl.config.recipes import find
         >>> sources(find("giril"), [])
         {}
     """
