@@ -8,6 +8,7 @@ help. Nothing heavy is imported here.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 from omegaconf import MISSING
 
@@ -226,6 +227,19 @@ class BCConfig:
         100, "gradient steps between logged losses, where held-out ones are compared", low=1
     )
 
+    def check(self, prefix: str, run: Any) -> None:
+        """Refuses environment steps, and early stopping without validation pairs."""
+        if run.steps:
+            raise UserError(
+                f"steps={run.steps}: cloning takes no environment steps; leave steps=0, "
+                f"{prefix}steps is the number of gradient steps."
+            )
+        if self.stop == "held_out" and run.demo.subsample == 1:
+            raise UserError(
+                f"{prefix}stop=held_out needs transitions to hold out and demo.subsample=1 leaves "
+                f"none: set demo.subsample to at least 2, or {prefix}stop=fixed."
+            )
+
 
 @dataclass
 class ScalingConfig:
@@ -287,6 +301,14 @@ class ExpertRunConfig(RunConfig):
     stop_early: bool = knob(True, "stop once the mean return reaches task.expert_score")
     clip_reward: bool = knob(False, "learn from the reward's sign (Atari); scores are unclipped")
     scaling: ScalingConfig = field(default_factory=lambda: ScalingConfig(reset="done"))
+
+    def check(self, prefix: str, run: Any) -> None:
+        """Refuses another horizon than the task's own."""
+        if self.task.horizon != "own":
+            raise UserError(
+                f"task.horizon={self.task.horizon}: an expert plays the task as it is; leave "
+                "task.horizon=own."
+            )
 
 
 @dataclass

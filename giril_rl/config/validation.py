@@ -10,10 +10,8 @@ from typing import Any
 from giril_rl.config.imports import check_names
 from giril_rl.config.knobs import Knob, default_text, knobs
 from giril_rl.config.schema import (
-    BCConfig,
     DemoConfig,
     ExpertConfig,
-    ExpertRunConfig,
     PPOConfig,
     RunConfig,
 )
@@ -72,11 +70,6 @@ def _check_run(config: RunConfig) -> None:
             f"ppo.normalise_observations=true is for vectors, and {config.task.name} has frames, "
             "which are divided by 255: leave it out."
         )
-    if isinstance(config, ExpertRunConfig):
-        _check_expert_run(config)
-    cloning = getattr(config, "bc", None)
-    if isinstance(cloning, BCConfig):
-        _check_cloning(config, cloning)
 
 
 def _check_observations(name: str, part: Any, config: RunConfig) -> None:
@@ -98,27 +91,6 @@ def _check_observations(name: str, part: Any, config: RunConfig) -> None:
             )
 
 
-def _check_expert_run(config: ExpertRunConfig) -> None:
-    if config.task.horizon != "own":
-        raise UserError(
-            f"task.horizon={config.task.horizon}: an expert plays the task as it is; leave "
-            "task.horizon=own."
-        )
-
-
-def _check_cloning(config: Any, cloning: BCConfig) -> None:
-    if config.steps:
-        raise UserError(
-            f"steps={config.steps}: cloning takes no environment steps; leave steps=0, bc.steps is "
-            "the number of gradient steps."
-        )
-    if cloning.stop == "held_out" and config.demo.subsample == 1:
-        raise UserError(
-            "bc.stop=held_out needs transitions to hold out and demo.subsample=1 leaves none: "
-            "set demo.subsample to at least 2, or bc.stop=fixed."
-        )
-
-
 def notices(config: Any) -> list[str]:
     """Sentences about settings that are rounded.
 
@@ -132,7 +104,7 @@ def notices(config: Any) -> list[str]:
         ['steps=15000 is no multiple of a batch (16 * 125 = 2,000): 16,000 steps are taken.']
     """
     found = []
-    trains = getattr(config, "reward", None) not in ("random", "held_action")
+    trains = getattr(config, "trains", True)  # A random policy and a held action do not.
     if isinstance(config, RunConfig) and trains:  # Cloning has 0 steps.
         found += _rounding("steps", config.steps, config.ppo)
     expert, demo = getattr(config, "expert", None), getattr(config, "demo", None)
