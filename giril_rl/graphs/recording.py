@@ -106,7 +106,7 @@ class ModuleGraph:
             out = call(state, tensors[size:])
             for name, buffer in buffers.items():
                 if state[name] is not buffer:
-                    raise CannotRecord(f"it puts another tensor in the place of its buffer {name}")
+                    raise CannotRecord(f"the module replaces its buffer {name}")
             return out
 
         if not self._recorded:
@@ -114,15 +114,15 @@ class ModuleGraph:
         settings = self._settings.read()
         try:
             if len(self._graphs) == _MOST_GRAPHS:
-                raise CannotRecord(f"its batches or attributes have more than {_MOST_GRAPHS} kinds")
+                raise CannotRecord(f"batches or attributes have more than {_MOST_GRAPHS} kinds")
             graph = record(pure, [*self._state, *inputs], eager=eager, compile=self._compile)
             if self._settings.read() != settings:
-                raise CannotRecord("its attributes change with each call")
+                raise CannotRecord("the module's attributes change with each call")
         except CannotRecord as error:
             self._recorded = False
             warnings.warn(
-                f"{self._label} run as they are, with the same numbers and more time in Python, "
-                f"for they cannot be recorded: {error}.",
+                f"{self._label} cannot be recorded as a graph and run as they are, with the same "
+                f"numbers but more slowly: {error}.",
                 stacklevel=2,
             )
             return eager, names
@@ -214,7 +214,7 @@ def record(
             same = all(_equal(one, other) for one, other in zip(found, expected, strict=True))
             if same:
                 return compiled(candidate, device) if compile else candidate
-    raise CannotRecord("recorded, it gives other numbers or draws other random ones")
+    raise CannotRecord("the graph gives other numbers or draws other random ones")
 
 
 def _in_torchscript(graph: fx.GraphModule, inputs: Sequence[Tensor]) -> list[Function]:
@@ -243,10 +243,10 @@ def _graph(function: Function, inputs: Sequence[Tensor]) -> fx.GraphModule:
             reason = "Python looks at the value of a tensor"
         raise CannotRecord(reason) from error
     if others != (random.getstate(), np.random.get_state()[1].tobytes()):  # type: ignore[index]
-        raise CannotRecord("it draws random numbers by Python or NumPy")
+        raise CannotRecord("Python or NumPy draws random numbers")
     for node in graph.graph.nodes:
         if _size_depends_on_values(node):
-            raise CannotRecord(f"the size of what {node.target} gives depends on its input")
+            raise CannotRecord(f"the size of the result of {node.target} depends on its input")
     graph.graph.eliminate_dead_code()
     graph.recompile()
     return graph

@@ -114,7 +114,7 @@ class RecordedActing(ActingPolicy):
             out = torch.func.functional_call(act, state, tuple(inputs))
             return dict(zip(agent.acting_keys, out, strict=True))
 
-        self._graph = ModuleGraph(act, graph, label="the policy's actions", compile=compile)
+        self._graph = ModuleGraph(act, graph, label="the policy's forward passes", compile=compile)
 
     def act(self, observation: Tensor) -> Sequence[Tensor]:
         """A draw for observations on the agent's device."""

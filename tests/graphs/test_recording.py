@@ -10,10 +10,8 @@ import torch.nn.functional as F
 from tensordict import TensorDict
 from torch import nn
 from torch.nn.utils.parametrizations import spectral_norm
-from torchrl.data import Bounded
 
 from giril_rl.graphs import TracedGradients
-from giril_rl.policies import ActorCritic, RecordedActing
 
 
 class Loss(nn.Module):
@@ -178,23 +176,3 @@ def test_endless_kinds_of_batches_are_not_all_kept(monkeypatch):
     monkeypatch.setattr("giril_rl.graphs.recording._MOST_GRAPHS", 2)
     with pytest.warns(UserWarning, match="more than 2 kinds"):
         assert_as_eager(Loss(body()()), change=nn.Module.eval)
-
-
-@pytest.mark.parametrize("layer", [nn.LayerNorm(16), nn.BatchNorm1d(16), nn.Dropout(0.5)])
-def test_a_policy_acts_with_them_in_either_mode(layer):
-    agent = ActorCritic(4, Bounded(-1, 1, shape=(8, 2)), hidden=(16,))
-    agent.actor.insert(1, layer)
-    twin = copy.deepcopy(agent)
-    recorded = RecordedActing(agent)
-    for step in range(4):
-        if step == 2:
-            agent.eval()
-            twin.eval()
-        observation = TensorDict({"observation": torch.randn(8, 4)}, [8])
-        actions = []
-        for policy in (recorded, twin.acting()):
-            torch.manual_seed(step)
-            actions.append(policy(observation.clone())["action"])
-        assert torch.equal(*actions)
-        for buffer, other in zip(agent.buffers(), twin.buffers(), strict=True):
-            assert torch.equal(buffer, other)

@@ -1,7 +1,10 @@
+import copy
+
 import pytest
 import torch
 from compiler import needs_compiler
 from tensordict import TensorDict
+from torch import nn
 from torchrl.data import Bounded, Categorical
 
 from giril_rl.policies import (
@@ -48,18 +51,13 @@ def test_it_acts_as_the_acting_policy_does_bit_for_bit(agent):
         change_in_place(agent)
 
 
-def test_each_call_draws_anew(agent):
+def test_each_call_draws_anew_and_into_new_tensors(agent):
     policy = RecordedActing(agent)
-    data = [policy(TensorDict({"observation": torch.zeros(8, 4)}, [8])) for _ in range(20)]
-    assert len({tuple(x["action"].flatten().tolist()) for x in data}) > 1
-
-
-def test_what_was_handed_out_stays_as_it_was(agent):
-    policy = RecordedActing(agent)
-    first = act(policy, torch.ones(8, 4), 0)
-    before = first.clone()
+    acted = [policy(TensorDict({"observation": torch.zeros(8, 4)}, [8])) for _ in range(20)]
+    assert len({tuple(x["action"].flatten().tolist()) for x in acted}) > 1
+    before = acted[0].clone()
     act(policy, -torch.ones(8, 4), 1)
-    assert all(torch.equal(first[key], before[key]) for key in before.keys())
+    assert all(torch.equal(acted[0][key], before[key]) for key in before.keys())
 
 
 def test_a_state_dict_loaded_later_is_acted_on(agent):
@@ -103,3 +101,23 @@ def test_compiled_it_acts_by_the_same_probabilities_and_values():
         seen.add(tuple(acted["action"].tolist()))
     assert len(seen) > 5
     assert torch.equal(act(policy, frames, 7)["action"], act(policy, frames, 7)["action"])
+
+
+@pytest.mark.parametrize("layer", [nn.LayerNorm(16), nn.BatchNorm1d(16), nn.Dropout(0.5)])
+def test_layers_with_a_mode_act_in_either(layer):
+    agent = ActorCritic(4, SPECS["box"], hidden=(16,))
+    agent.actor.insert(1, layer)
+    twin = copy.deepcopy(agent)
+    recorded = RecordedActing(agent)
+    for step in range(4):
+        if step == 2:
+            agent.eval()
+            twin.eval()
+        observation = TensorDict({"observation": torch.randn(8, 4)}, [8])
+        actions = []
+        for policy in (recorded, twin.acting()):
+            torch.manual_seed(step)
+            actions.append(policy(observation.clone())["action"])
+        assert torch.equal(*actions)
+        for buffer, other in zip(agent.buffers(), twin.buffers(), strict=True):
+            assert torch.equal(buffer, other)
