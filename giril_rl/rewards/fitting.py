@@ -55,8 +55,8 @@ class TransitionLoss(RewardLoss):
     transition each.
 
     Args:
-        reward: the module to train, which reads observation, action and next observation; its
-            parameters are this loss's parameters.
+        reward: the module to train, which reads observation and action, and the next observation
+            or not; its parameters are this loss's parameters.
         reduction: ``"mean"``, ``"sum"`` or ``"none"`` over transitions.
         functional: keep parameters and buffers apart from the module, under ``reward_params``, as
             TorchRL's own losses do. By default they stay in the module: the loss's ``state_dict``
@@ -102,14 +102,13 @@ class TransitionLoss(RewardLoss):
             raise UserError(f"reduction={reduction!r} is unknown: choose mean, sum or none.")
         super().__init__(reward, functional=functional)
         self.reduction = reduction
-        observation, action, next_observation = reward.in_keys
-        self.set_keys(observation=observation, action=action, next_observation=next_observation)
+        self._entries = ("observation", "action", "next_observation")[: len(reward.in_keys)]
+        self.set_keys(**dict(zip(self._entries, reward.in_keys, strict=True)))
 
     @property
     def in_keys(self) -> list[NestedKey]:
-        """Keys of observation, action and next observation."""
-        keys = self.tensor_keys
-        return [keys.observation, keys.action, keys.next_observation]
+        """Keys of observation, action and, if the reward reads it, next observation."""
+        return [getattr(self.tensor_keys, entry) for entry in self._entries]
 
     @property
     @abstractmethod
@@ -117,15 +116,11 @@ class TransitionLoss(RewardLoss):
         """Names of the terms, ``loss_*``."""
 
     @abstractmethod
-    def terms(
-        self, observation: Tensor, action: Tensor, next_observation: Tensor
-    ) -> tuple[Tensor, ...]:
+    def terms(self, *args: Any, **kwargs: Any) -> tuple[Tensor, ...]:
         """The terms in the order of their names, each of the batch's shape.
 
-        Args:
-            observation: ``(*batch, d)``, as the environment gives it.
-            action: as the environment takes it.
-            next_observation: ``(*batch, d)``.
+        A subclass takes what the reward reads: ``observation`` ``(*batch, d)``, as the environment
+        gives it, ``action``, as the environment takes it, and perhaps ``next_observation``.
         """
 
     @dispatch
@@ -212,7 +207,7 @@ def fit(
 
 def _check(loss: TransitionLoss, demonstration: TensorDictBase) -> None:
     """Checks the whole demonstration once, so that minibatches need no checks of values."""
-    entries = observation, action, _ = read(demonstration, loss.in_keys)
+    entries = observation, action, *_ = read(demonstration, loss.in_keys)
     scaler, actions = loss.reward.scaler, loss.reward.actions
     batch = observation.shape[: observation.ndim - scaler.event_dims]
     if batch != demonstration.batch_size:

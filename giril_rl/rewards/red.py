@@ -27,8 +27,8 @@ from giril_rl.rewards.fitting import Reduction, TransitionLoss
 from giril_rl.rewards.method import GREY, Method, register
 from giril_rl.rewards.scaler import ObservationScaler, PixelScaler, ScalingRule
 from giril_rl.rewards.transitions import (
+    PAIR_KEYS,
     REWARD_KEYS,
-    TRANSITION_KEYS,
     TransitionReward,
     check_transitions,
     observation_shape,
@@ -80,7 +80,7 @@ def distillation_reward(predicted: Tensor, target: Tensor, sigma: Tensor | float
 
 
 class DistillationReward(Pretrained, TransitionReward):
-    """RED's reward, in (0, 1], of observation and action; the next observation is not used.
+    """RED's reward, in (0, 1], of observation and action.
 
     Train it with :class:`DistillationLoss`, after ``reward.scaler.fit(observations)``, then choose
     sigma with :meth:`calibrate`.
@@ -91,7 +91,7 @@ class DistillationReward(Pretrained, TransitionReward):
         scaler: applied to observations.
         actions: encodes actions.
         sigma: sharpness.
-        in_keys: keys of observation, action and next observation.
+        in_keys: keys of observation and action.
         out_keys: where the reward is written, one key.
 
     Raises:
@@ -117,11 +117,10 @@ class DistillationReward(Pretrained, TransitionReward):
         scaler: ObservationScaler | PixelScaler,
         actions: ActionEncoder,
         sigma: float = 1.0,
-        in_keys: Sequence[NestedKey] = TRANSITION_KEYS,
+        in_keys: Sequence[NestedKey] = PAIR_KEYS,
         out_keys: Sequence[NestedKey] = REWARD_KEYS,
     ) -> None:
-        roles = "observation", "action", "next observation"
-        super().__init__("a distillation reward", roles, in_keys, out_keys)
+        super().__init__("a distillation reward", ("observation", "action"), in_keys, out_keys)
         self.predictor = predictor
         self.target = target.requires_grad_(False)
         self.scaler = scaler
@@ -141,7 +140,7 @@ class DistillationReward(Pretrained, TransitionReward):
         normalise: ScalingRule = "standardise",
         clamp: bool = True,
         seed: int = 0,
-        in_keys: Sequence[NestedKey] = TRANSITION_KEYS,
+        in_keys: Sequence[NestedKey] = PAIR_KEYS,
         out_keys: Sequence[NestedKey] = REWARD_KEYS,
     ) -> DistillationReward:
         """Two multilayer perceptrons, initialised from ``seed`` alone.
@@ -185,7 +184,7 @@ class DistillationReward(Pretrained, TransitionReward):
         features: int = 100,
         sigma: float = 1.0,
         seed: int = 0,
-        in_keys: Sequence[NestedKey] = TRANSITION_KEYS,
+        in_keys: Sequence[NestedKey] = PAIR_KEYS,
         out_keys: Sequence[NestedKey] = REWARD_KEYS,
     ) -> DistillationReward:
         """ICM's convolutions and a linear layer for ``channels`` frames; see `for_vectors`."""
@@ -210,8 +209,7 @@ class DistillationReward(Pretrained, TransitionReward):
 
     def value(self, *transitions: Tensor) -> Tensor:
         """The reward of each transition."""
-        observation, action, _ = transitions
-        return distillation_reward(*self.outputs(observation, action), self.sigma)
+        return distillation_reward(*self.outputs(*transitions), self.sigma)
 
     @torch.no_grad()
     def calibrate(self, pairs: TensorDictBase, demo_reward: float = 0.9) -> None:
@@ -300,12 +298,10 @@ class DistillationLoss(TransitionLoss):
         """The name of the term."""
         return ["loss_distillation"]
 
-    def terms(
-        self, observation: Tensor, action: Tensor, next_observation: Tensor
-    ) -> tuple[Tensor, ...]:
+    def terms(self, observation: Tensor, action: Tensor) -> tuple[Tensor, ...]:
         """The squared error of each transition."""
         reward = self.reward
-        check_transitions(reward.scaler, reward.actions, observation, action, next_observation)
+        check_transitions(reward.scaler, reward.actions, observation, action)
         predicted, target = reward.outputs(observation, action)
         return ((predicted - target).square().sum(-1),)
 

@@ -109,10 +109,11 @@ def check_transitions(
     actions: ActionEncoder,
     observation: Tensor,
     action: Tensor,
-    next_observation: Tensor,
+    next_observation: Tensor | None = None,
 ) -> None:
     """:func:`check_states` and :func:`check_actions`; the scaler checks an observation's size."""
-    check_states(observation, next_observation)
+    if next_observation is not None:
+        check_states(observation, next_observation)
     check_actions(actions, action, observation, scaler.event_dims)
 
 

@@ -10,13 +10,14 @@ from torchrl.data import Bounded, Categorical
 from torchrl.envs import Compose
 from torchrl.objectives.value import GAE
 
-from giril_rl.config.schema import AdversarialConfig, PPOConfig
+from giril_rl.config.schema import PPOConfig
 from giril_rl.graphs import recording
 from giril_rl.graphs.gradients import TracedGradients
 from giril_rl.graphs.recording import record
 from giril_rl.policies.actor_critic import ActorCritic
 from giril_rl.policies.pixel_actor_critic import PixelActorCritic
 from giril_rl.rewards import (
+    AdversarialConfig,
     AffineReward,
     BottleneckLoss,
     BottleneckReward,
