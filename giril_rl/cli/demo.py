@@ -1,4 +1,4 @@
-"""The subcommand ``giril demo``."""
+"""``giril demo``: show, import, export or play a demonstration."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from giril_rl.cli.parser import Parser, check_number
 from giril_rl.errors import UserError
 
 FASTEST = 50
-"""Frames a second: a GIF counts in hundredths of a second, and viewers slow down a single one."""
+"""Frames per second: a GIF counts in hundredths of a second, and viewers slow down a single one."""
 
 
 def demo(argv: Sequence[str], description: str | None = None) -> int:
-    """Shows, imports, exports or plays a demonstration.
+    """Does what the words after ``giril demo`` ask for.
 
     Args:
-        argv: the words after ``giril demo``.
+        argv: the words.
         description: of the command, for its help.
 
     Raises:
-        UserError: for a demonstration or data set that is missing or not sound; nothing is written
-            then.
+        UserError: for a demonstration or data set that is missing or damaged; then nothing is
+            written.
     """
     parser = Parser("giril demo", description=description)
     kinds = parser.add_subparsers(metavar="show|import|export|play", required=True)
@@ -57,7 +57,7 @@ def _add_task(parser: Parser) -> None:
 
 
 def _import_modules(args: Namespace) -> None:
-    """Those that the command line names; what a demonstration's card names is not imported."""
+    """Imports the modules that the command line names, not those of a demonstration's card."""
     from giril_rl.config.imports import import_modules, named_modules
 
     import_modules([*args.imports, *named_modules(args.env_id)], Path.cwd())
@@ -117,10 +117,12 @@ def _run_show(args: Namespace) -> None:
     args.path = _found_folder(args.path)
     _check_picture(args.out, args.fps)
     from giril_rl.demos import Demonstration
-    from giril_rl.demos.show import describe, write_gif
+    from giril_rl.demos.show import describe
 
     found = Demonstration.load(args.path)
     if args.out is not None:
+        from giril_rl.demos.show import write_gif
+
         write_gif(found, args.out, args.fps)
     print(describe(found))
 
@@ -130,7 +132,8 @@ def _run_import(args: Namespace) -> None:
     _check_new(args.out)
     check_number("--episodes", args.episodes, least=1)
     _import_modules(args)
-    from giril_rl.demos import import_demonstration, named_task
+    from giril_rl.config.tasks import named_task
+    from giril_rl.demos.importing import import_demonstration
 
     task = named_task(args.task, args.env_id)
     found = import_demonstration(args.source, task, episodes=args.episodes, name=args.name)
@@ -142,8 +145,7 @@ def _run_import(args: Namespace) -> None:
 def _run_export(args: Namespace) -> None:
     """Write a demonstration for others, as a Minari dataset or a plain file."""
     args.path = _found_folder(args.path)
-    from giril_rl.demos import Demonstration, named_task, to_minari, to_npz
-    from giril_rl.envs import as_recorded_task, gym_factory
+    from giril_rl.demos import Demonstration, to_minari, to_npz
 
     found = Demonstration.load(args.path)
     if args.npz is not None:
@@ -151,6 +153,9 @@ def _run_export(args: Namespace) -> None:
         print(f"{args.npz} has {len(found):,} transitions, {found.num_episodes:,} episodes.")
         return
     _import_modules(args)
+    from giril_rl.config.tasks import named_task
+    from giril_rl.envs import as_recorded_task, gym_factory
+
     env_id = args.env_id
     if args.task is None and env_id is None:
         env_id = found.card.get("env_id")
@@ -170,7 +175,7 @@ def _run_play(args: Namespace) -> None:
     check_number("--episodes", args.episodes, least=1)
     check_number("--seed", args.seed, least=0)
     _import_modules(args)
-    from giril_rl.demos import named_task
+    from giril_rl.config.tasks import named_task
     from giril_rl.demos.play import Window, play_demonstration
     from giril_rl.envs import as_recorded_task, gym_factory
 
@@ -191,9 +196,11 @@ def _run_play(args: Namespace) -> None:
 
 
 def _found_folder(path: Path) -> Path:
-    from giril_rl.demos.shipped import demonstration_folder
+    folder = path
+    if str(path).partition(":")[0] == "shipped":
+        from giril_rl.demos.shipped import demonstration_folder
 
-    folder = demonstration_folder(path)
+        folder = demonstration_folder(path)
     if not (folder / "card.json").is_file():
         raise UserError(
             f"{path} is not the folder of a demonstration: recipes keep theirs in "
@@ -203,7 +210,7 @@ def _found_folder(path: Path) -> Path:
 
 
 def _check_new(out: Path) -> None:
-    """Before any work, what saving would refuse after it."""
+    """Refuses before the work what saving would refuse after it."""
     if out.is_file() or (out.is_dir() and any(out.iterdir())):
         raise UserError(f"{out} is there already: choose another folder, or delete it.")
 

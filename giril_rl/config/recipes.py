@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import ast
 import importlib.util
+import itertools
 import shutil
 import sys
 from collections.abc import Iterator
@@ -163,10 +164,14 @@ def config_class(recipe: Recipe) -> type[Any]:
     return recipe.load().Config
 
 
+_READINGS = itertools.count()
+
+
 def _defined(name: str, path: Path, module_name: str) -> Any:
     """What ``name`` is in a file of which only the statements that it needs are run."""
-    module = ModuleType(f"giril_config_of_{module_name}.{name}")
-    # Dataclasses look up their module by name when their annotations are read.
+    # A name of its own for each: dataclasses look up their module by it when their annotations are
+    # read, and what a later reading defines are other classes.
+    module = ModuleType(f"giril_config_of_{module_name}.{name}.{next(_READINGS)}")
     sys.modules[module.__name__] = module
     run: list[ast.stmt] = []
     statements, names = _needed_for(name, ast.parse(path.read_text("utf-8")).body)

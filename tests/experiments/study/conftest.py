@@ -64,7 +64,6 @@ SETTINGS = """
 defaults:
   - recipe_schema
   - task: inverted_pendulum
-  - profile: released
   - _self_
 steps: ${task.steps}
 """

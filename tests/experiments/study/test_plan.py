@@ -45,7 +45,7 @@ groups:
   - label: a
     recipe: fake.py
     steps: 1_000_000
-    profile: released
+    ppo.epochs: 10
     widths: [4]
     ppo.clip: [0.1, 0.2]
 """
@@ -130,7 +130,7 @@ def test_a_study_that_is_cut_short_has_every_row_of_the_first_seed(study):
             "mine, group 'a': out is not a knob of a study's runs",
         ),
         (
-            "groups: [{label: a, recipe: fake.py}, {label: b, recipe: fake.py, profile: released}]",
+            "groups: [{label: a, recipe: fake.py}, {label: b, recipe: fake.py, ppo.epochs: 10}]",
             "mine: groups 'a' and 'b' both ask for the run fake/inverted_pendulum/default/seed0: ",
         ),
         (
