@@ -35,7 +35,7 @@ def test_a_copied_recipe_of_before_runs_with_warnings(tmp_path):
         done.stderr
     )
     assert "giril_rl.configs is now giril_rl.config.schema; " in done.stderr
-    assert "giril_rl.training.generative_reward is now giril_rl.methods." in done.stderr
+    assert "giril_rl.training.generative_reward is now giril_rl.rewards." in done.stderr
 
 
 def test_every_old_name_is_found():

@@ -120,10 +120,11 @@ class Recipe:
     def _check_name(self) -> None:
         """Refuses a file, such as an early copy, that names its runs after another recipe."""
         for node in ast.walk(self.tree()):
-            if not isinstance(node, ast.Call) or not isinstance(node.func, ast.Attribute):
+            if not isinstance(node, ast.Call):
                 continue
+            called = getattr(node.func, "attr", getattr(node.func, "id", None))
             words = {word.arg: word.value for word in node.keywords}
-            name = words.get("recipe") if node.func.attr == "open" else None
+            name = words.get("recipe") if called in ("open", "open_run", "train_expert") else None
             if isinstance(name, ast.Constant) and name.value != self.name:
                 raise UserError(
                     f"{self.path}, line {name.lineno}: its runs would be called {name.value!r}, "

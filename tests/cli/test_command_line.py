@@ -181,10 +181,10 @@ def test_usage(argv, capsys):
 
 
 def test_copy_runs_with_its_own_changed_default(fake, monkeypatch, refused):
-    assert main(["cp", "giril", "mine.py"]) == 0
-    shipped = recipes.find("giril")
+    assert main(["cp", "gail", "mine.py"]) == 0
+    shipped = recipes.find("gail")
     assert Path("mine.py").read_text() == shipped.path.read_text()
-    assert refused("cp", "giril", "mine.py").startswith("mine.py exists")
+    assert refused("cp", "gail", "mine.py").startswith("mine.py exists")
     Path("mine.py").write_text(FAKE.replace("knob(4", "knob(5"))
     settings = Path("mine.yaml").read_text() + "\nppo: {lr: 0.25}\n"
     Path("mine.yaml").write_text(settings)
@@ -255,7 +255,7 @@ def test_a_folder_with_odd_characters_is_no_obstacle(fake, tmp_path, monkeypatch
         (FAKE, SETTINGS + "ppo: {lr: x}\n", "ppo.lr=x: a number is needed"),
         (FAKE, SETTINGS + "a: [\n", "is not valid YAML, line"),
         (FAKE, "steps: 3\n", "needs a `defaults` list with `recipe_schema` in it"),
-        (FAKE, SETTINGS.replace("released", "nothing"), "cannot be composed: "),
+        (FAKE, SETTINGS.replace("inverted_pendulum", "nothing"), "cannot be composed: "),
         (FAKE.replace("def main", "def start"), SETTINGS, "has no `main(cfg, out)`"),
         (FAKE.replace("(RunConfig)", ""), SETTINGS, "has no `Config`"),
         (FAKE.split('"""', 2)[2], SETTINGS, "begins with no docstring"),
