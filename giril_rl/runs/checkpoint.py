@@ -14,8 +14,8 @@ random numbers         :func:`~giril_rl.runs.randomness.rng_state`, and the stat
 environments           the simulators' state and the unfinished episodes, where there are any
 =====================  ===========================================================================
 
-What a loop must do in return, in this order: put the state back inside :func:`refusing_misfits`, drop
-later rows of its phase with :meth:`Run.truncate_metrics
+What a loop must do in return, in this order: put the state back inside
+:func:`refusing_misfits`, drop later rows of its phase with :meth:`Run.truncate_metrics
 <giril_rl.runs.run.Run.truncate_metrics>`, and save only what is finite (:class:`Finite
 <giril_rl.runs.finite_checks.Finite>`). ``tests/trust/test_kill.py`` kills runs at every write and
 compares the results. The keys are in ``training/loop.py`` (``_Session.save`` and ``restore``),
