@@ -243,7 +243,7 @@ def compose(recipe: Recipe, config: type[Any], texts: Sequence[str]) -> Composed
     Examples:
         >>> from giril_rl.config.schema import RunConfig
         >>> from giril_rl.config.recipes import find
-        >>> composed = compose(find("giril"), RunConfig, ["task.env_id=Pendulum-v1", "steps=1000"])
+        >>> composed = compose(find("gail"), RunConfig, ["task.env_id=Pendulum-v1", "steps=1000"])
         >>> composed.config().task.name, composed.config().steps
         ('Pendulum-v1', 1000)
     """

@@ -52,6 +52,7 @@ def make_agent(env: BatchedEnv, cfg: PPOConfig, seed: int, *, use: Use = "traini
     """An untrained agent for ``env``, initialised from ``use`` and ``seed`` alone.
 
     Examples:
+        >>> import torch
         >>> env = make_env(TaskConfig(name="cartpole", env_id="CartPole-v1"), num_envs=1, seed=0)
         >>> make_agent(env, PPOConfig(), seed=0).critic(torch.zeros(1, 4)).shape
         torch.Size([1, 1])

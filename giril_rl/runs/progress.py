@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import threading
 from typing import Any, TextIO
 
 from tqdm import tqdm
@@ -85,3 +86,7 @@ class progress(tqdm):
         if self._is_log and not self.disable and self.n == self.last_print_n:
             self.leave = False
         super().close()
+
+
+# tqdm's own lock is one of processes too, of which a process that is killed leaves a semaphore.
+progress.set_lock(threading.RLock())

@@ -7,7 +7,7 @@ from typing import Any
 
 from torch import nn
 
-from giril_rl.config.schema import AveragedRunConfig, DemoConfig, RunConfig
+from giril_rl.config.schema import AveragedRunConfig, DemoConfig, RewardRunConfig, RunConfig
 from giril_rl.demos import Demonstration
 from giril_rl.demos.shipped import demonstration_name
 from giril_rl.policies.agent import Agent
@@ -61,13 +61,16 @@ def finish_run(
         trained: its steps and seconds.
         expert: the expert's result, if there was one.
         demo: the demonstration, if there was one.
-        seeds: seeds besides those of policy, evaluation, expert and demonstration.
+        seeds: seeds besides those of policy, evaluation, expert and demonstration; None takes the
+            reward model's, if there is a reward.
         reward: the reward module, if there is one; kept beside the policy if it can be.
 
     Returns:
         What ``result.json`` holds.
     """
     scores = evaluate_both(agent, cfg.task, episodes=cfg.eval.episodes, seed=cfg.eval.seed)
+    if seeds is None and reward is not None and isinstance(cfg, RewardRunConfig):
+        seeds = {"reward": cfg.reward_seed}
     has_score = demo is not None and demo.has_rewards
     result: dict[str, Any] = {
         "method": method_name(run.recipe, cfg),

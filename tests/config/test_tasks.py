@@ -5,13 +5,13 @@ from giril_rl.config.compose import resolved
 from giril_rl.config.knobs import flat, knobs
 from giril_rl.config.recipes import config_class, find, shipped, shipped_conf
 from giril_rl.config.schema import (
-    ControlRunConfig,
     ExpertRunConfig,
     PPOConfig,
     RunConfig,
     TaskConfig,
 )
 from giril_rl.config.tasks import apply_task_defaults, task_defaults
+from giril_rl.methods import ControlRunConfig
 
 PONG, PENDULUM = "ALE/Pong-v5", "Pendulum-v1"
 RECIPES = [recipe.name for recipe in shipped()]

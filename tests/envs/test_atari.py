@@ -433,5 +433,5 @@ def test_refusals():
         make_env(TaskConfig(name="x", env_id="ALE/Brekout-v5"), 1, seed=0)
     with pytest.raises(UserError, match="brekout is not a game of ale-py; did you mean 'breakout'"):
         AtariGame("brekout")
-    with pytest.raises(UserError, match="must be 'life' or 'game'"):
+    with pytest.raises(UserError, match="choose one of life, game"):
         AtariGymEnv("breakout", episode="lives")

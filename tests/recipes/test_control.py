@@ -49,12 +49,10 @@ def test_a_copy_is_a_method_of_its_own_and_has_no_profile_where_nothing_is_avera
     result = run(str(file), tmp_path / "averaged", root)
     assert (result["method"], result["profile"]) == ("mine", "released")
     text = file.read_text()
-    averaging = "*([BatchMeanReward()] if cfg.batch_mean else []),"
+    averaging = "*[BatchMeanReward()] * cfg.batch_mean,"
     assert averaging in text
-    text = text.replace("demo=demo,\n", 'demo=demo,\n            method="giril",\n')
     file.write_text(text.replace(averaging, ""))
-    with pytest.warns(DeprecationWarning, match="method= is not read"):
-        result = run(str(file), tmp_path / "not_averaged", root)
+    result = run(str(file), tmp_path / "not_averaged", root)
     assert (result["method"], result["profile"]) == ("mine", None)
     card = json.loads((tmp_path / "not_averaged" / "policy" / "card.json").read_text())
     assert (card["method"], card["profile"]) == ("mine", None)

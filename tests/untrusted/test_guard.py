@@ -18,7 +18,11 @@ FORBIDDEN = {
 }
 ALLOWED = {
     # The statements of a recipe's own file that make its Config: a recipe is code by intent.
-    ("giril_rl/config/recipes.py", "            exec(code, module.__dict__)"),
+    (
+        "giril_rl/config/recipes.py",
+        '    exec(compile(ast.Module(run, []), str(path), "exec", dont_inherit=True), '
+        "module.__dict__)",
+    ),
 }
 
 

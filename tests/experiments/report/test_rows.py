@@ -185,7 +185,7 @@ def test_controls_are_not_told_apart_by_what_they_do_not_read(made):
 def registered():
     """Two more methods in the registry, of which the control has no reward."""
     zero = Method("control:zero", "zeros", "#654321", kind="control", trained="never", rank=300)
-    found = [Method("red", "RED", "#123456"), zero]
+    found = [Method("mine", "Mine", "#123456"), zero]
     yield [register(method) for method in found]
     for method in found:
         unregister(method.name)
@@ -193,14 +193,14 @@ def registered():
 
 def test_the_report_learns_of_a_method_from_its_entry(made, registered):
     made("giril", score=1.0)
-    made("giril", score=2.0, name="red", extra={"recipe": "red"}, profile=None)
+    made("giril", score=2.0, name="mine", extra={"recipe": "mine"}, profile=None)
     for seed, lr in ((0, "0.1"), (1, "0.2")):
         words = (f"seed={seed}", f"ppo.lr={lr}")
         made("control", *words, score=3.0, extra={"reward": "zero"}, method="control:zero")
     (panel,) = panels(made)
     assert [(row.name, row.seeds, row.is_control, row.look.color) for row in panel.rows] == [
         ("GIRIL (released)", [0], False, BLUE),
-        ("RED", [0], False, "#123456"),
+        ("Mine", [0], False, "#123456"),
         ("zeros", [0, 1], True, "#654321"),
     ]
 
