@@ -242,3 +242,16 @@ def test_a_wrong_command_is_found(line, dry, capsys):
 def test_a_command_with_other_words_is_not_understood(line, dry, monkeypatch):
     with pytest.raises(pytest.fail.Exception):
         understood(line, monkeypatch)
+
+
+def test_the_rooms_of_the_page_are_those_of_the_contract():
+    contract = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]
+    floors = contract["contracts"][0]["layers"]
+    rooms = [
+        name.strip().removeprefix("giril_rl.") for floor in floors for name in floor.split("|")
+    ]
+    page = (ROOT / "docs" / "development.md").read_text(encoding="utf-8")
+    table = page.partition("## Rooms")[2].partition("## ")[0]
+    assert re.findall(r"^\| `(\w+)/?` \|", table, re.M) == rooms
+    there = {path.name for path in (ROOT / "giril_rl").iterdir() if (path / "__init__.py").exists()}
+    assert there == set(rooms) - {"errors"}

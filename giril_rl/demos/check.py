@@ -11,7 +11,7 @@ from torchrl.data import TensorSpec
 
 from giril_rl.config.schema import TaskConfig, split_id
 from giril_rl.demos.demonstration import Demonstration
-from giril_rl.demos.transitions import fault, first_true
+from giril_rl.demos.soundness import fault, first_true
 from giril_rl.envs import spaces_of
 from giril_rl.errors import UserError
 

@@ -13,6 +13,7 @@ from tensordict import TensorDict
 from tensordict.utils import NestedKey
 from torch import Tensor
 
+from giril_rl.demos.soundness import check_transitions
 from giril_rl.demos.storage import (
     FRAMES_FILE,
     load_frames,
@@ -20,7 +21,6 @@ from giril_rl.demos.storage import (
     save_frames,
     save_tensors,
 )
-from giril_rl.demos.transitions import check_transitions
 from giril_rl.errors import UserError
 from giril_rl.files.disk import name_file, read_json, temporary_sibling, write_json
 from giril_rl.files.untrusted import check_format

@@ -1,4 +1,8 @@
-"""Atari preprocessing: one game as 84 x 84 grey frames of four emulated frames each."""
+"""Atari preprocessing: one game as 84 x 84 grey frames of four emulated frames each.
+
+The emulator, ``ale_py``, skips frames, takes their maximum, and makes them grey and 84 x 84: these
+are its defaults. Four such frames are stacked in :mod:`giril_rl.envs.atari`.
+"""
 
 from __future__ import annotations
 

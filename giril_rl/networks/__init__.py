@@ -1,0 +1,1 @@
+"""Network bodies alone: perceptrons, convolutions, normalisers, distributions."""

@@ -5,7 +5,8 @@ gets it back from :meth:`Run.load <giril_rl.runs.run.Run.load>` when the same co
 To continue bit for bit, the dictionary must hold everything that the next step reads:
 
 =====================  ===========================================================================
-progress               steps done, seconds so far, whether training stopped early
+progress               steps done, seconds so far, inexact resumes, whether training stopped early
+                       and the recent returns that decide so
 modules                the state of policy, reward and transforms, with their running statistics
 optimizer              ``optimizer.state_dict()``
 random numbers         :func:`~giril_rl.runs.randomness.rng_state`, and the state of each generator
@@ -13,11 +14,12 @@ random numbers         :func:`~giril_rl.runs.randomness.rng_state`, and the stat
 environments           the simulators' state and the unfinished episodes, where there are any
 =====================  ===========================================================================
 
-What a loop must do in return, in this order: put the state back inside :func:`restoring`, drop
-later rows of its phase with :meth:`Run.truncate_metrics
+What a loop must do in return, in this order: put the state back inside
+:func:`refusing_misfits`, drop later rows of its phase with :meth:`Run.truncate_metrics
 <giril_rl.runs.run.Run.truncate_metrics>`, and save only what is finite (:class:`Finite
 <giril_rl.runs.finite_checks.Finite>`). ``tests/trust/test_kill.py`` kills runs at every write and
-compares the results.
+compares the results. The keys are in ``training/loop.py`` (``_Session.save`` and ``restore``),
+``training/fitting.py`` and ``training/cloning.py``.
 """
 
 from __future__ import annotations
@@ -45,7 +47,7 @@ FORMAT_VERSION = "1"
 
 
 @contextmanager
-def restoring(run: Run, phase: str) -> Iterator[None]:
+def refusing_misfits(run: Run, phase: str) -> Iterator[None]:
     """Report a checkpoint that does not fit what it is loaded into.
 
     Args:
@@ -57,7 +59,7 @@ def restoring(run: Run, phase: str) -> Iterator[None]:
 
     Examples:
         >>> from types import SimpleNamespace
-        >>> with restoring(SimpleNamespace(folder=Path("runs/a")), "ppo"):
+        >>> with refusing_misfits(SimpleNamespace(folder=Path("runs/a")), "ppo"):
         ...     torch.nn.Linear(2, 1).load_state_dict({})
         Traceback (most recent call last):
         ...

@@ -12,9 +12,9 @@ from giril_rl.training.baselines import (
 )
 from giril_rl.training.cloning import clone_behaviour
 from giril_rl.training.demonstrations import check_inputs, obtain_demonstration, open_run
+from giril_rl.training.experts import check_task, train_expert
 from giril_rl.training.fitting import fit_reward
 from giril_rl.training.loop import Trained, train_policy
-from giril_rl.training.players import check_task, train_expert
 from giril_rl.training.ppo import PPO, return_scaling
 from giril_rl.training.result import finish_run
 from giril_rl.training.reward_trainers import AdversarialTrainer, RewardTrainer

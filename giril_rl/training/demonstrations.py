@@ -27,8 +27,8 @@ from giril_rl.policies.making import load_agent
 from giril_rl.runs.finished import read_config, read_part, read_result
 from giril_rl.runs.identity import NO_EFFECT, config_hash, out_folder, safe, without_added
 from giril_rl.runs.run import Run
+from giril_rl.training.experts import check_task, expert_settings, made_once, obtain_expert
 from giril_rl.training.outlook import announce
-from giril_rl.training.players import check_task, expert_settings, made_once, obtain_expert
 
 
 def open_run(cfg: RunConfig, out: Path, *, recipe: str) -> Run:

@@ -13,7 +13,7 @@ from giril_rl.config.schema import FitConfig
 from giril_rl.graphs.gradients import TracedGradients
 from giril_rl.moved import renamed_argument
 from giril_rl.rewards.transitions import PIXELS_AT_ONCE
-from giril_rl.runs.checkpoint import restoring
+from giril_rl.runs.checkpoint import refusing_misfits
 from giril_rl.runs.finite_checks import Finite
 from giril_rl.runs.interrupt import Interrupt, Interrupted
 from giril_rl.runs.progress import progress
@@ -82,7 +82,7 @@ def run_fit(
     step, seconds = 0, 0.0
     saved = run.load(phase)
     if saved is not None:
-        with restoring(run, phase):
+        with refusing_misfits(run, phase):
             step, seconds = saved["step"], saved["seconds"]
             fit.load_state_dict(saved["fit"])
     run.truncate_metrics(phase, step)

@@ -17,7 +17,7 @@ from torchrl.collectors import Collector
 
 from giril_rl.envs import BatchedEnv
 from giril_rl.policies.making import check_actions
-from giril_rl.runs.checkpoint import restoring
+from giril_rl.runs.checkpoint import refusing_misfits
 from giril_rl.runs.finite_checks import Finite
 from giril_rl.runs.interrupt import Interrupt, Interrupted
 from giril_rl.runs.progress import progress
@@ -109,7 +109,7 @@ def train_policy(
         torch.manual_seed(stream_seed(use, seed))
         if saved is not None:
             session.restore(saved)
-            with restoring(run, phase):
+            with refusing_misfits(run, phase):
                 restore_rng(saved["rng"])
         if not exact:
             session.forget_episodes()
@@ -230,7 +230,7 @@ class _Session:
         """The checkpoint, if there is one, and its counters."""
         saved = self.run.load(self.phase)
         if saved is not None:
-            with restoring(self.run, self.phase):
+            with refusing_misfits(self.run, self.phase):
                 for name in ("steps", "seconds", "inexact_resumes", "stopped"):
                     setattr(self.trained, name, saved[name])
                 self.recent.extend(saved["recent"])
@@ -238,7 +238,7 @@ class _Session:
 
     def restore(self, saved: dict[str, Any]) -> None:
         """Puts a checkpoint's tensors back."""
-        with restoring(self.run, self.phase):
+        with refusing_misfits(self.run, self.phase):
             self.tracker.load_state_dict(saved["tracker"])
             self.transform.load_state_dict(saved["transform"])
             self.algorithm.load_state_dict(saved["algorithm"])
@@ -247,7 +247,7 @@ class _Session:
 
     def restore_simulators(self, env: BatchedEnv, saved: dict[str, Any]) -> bool:
         """Puts the simulators back; whether they came to where they were saved."""
-        with restoring(self.run, self.phase):
+        with refusing_misfits(self.run, self.phase):
             exact = env.restore_simulator(saved["simulator"])
         self.trained.inexact_resumes += not exact
         return exact

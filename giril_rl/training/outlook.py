@@ -1,4 +1,4 @@
-"""How long a run will take, said before it begins."""
+"""About how long a run will take, said before it begins."""
 
 from __future__ import annotations
 
@@ -13,8 +13,10 @@ STEPS_PER_SECOND = {
 """Rough rates of one core of a server of 2023, by kind of observation."""
 
 
-def outlook(cfg: RunConfig, expert: ExpertConfig, demo: DemoConfig, *, has_player: bool) -> str:
-    """One sentence that names each part of a run, its steps and about how long they take.
+def outlook(
+    cfg: RunConfig, expert: ExpertConfig, demo: DemoConfig, *, has_player: bool
+) -> dict[str, float]:
+    """The parts of a run, each with about how many seconds it takes on one core.
 
     Args:
         cfg: the recipe's settings.
@@ -25,30 +27,28 @@ def outlook(cfg: RunConfig, expert: ExpertConfig, demo: DemoConfig, *, has_playe
     Examples:
         >>> from giril_rl.config.schema import TaskConfig
         >>> cfg = RunConfig(task=TaskConfig(name="pong", env_id="ALE/Pong-v5"), steps=1_000_000)
-        >>> print(outlook(cfg, ExpertConfig(), DemoConfig(), has_player=False))
-        player: at most 5,000,000 steps, about 2.8 h; policy: 1,000,000 steps, about 33 min (rough
-        figures for one core, the bars below tell yours)
+        >>> outlook(cfg, ExpertConfig(), DemoConfig(), has_player=False)
+        {'player: at most 5,000,000 steps': 10000.0, 'policy: 1,000,000 steps': 2000.0}
     """
     rates = STEPS_PER_SECOND[cfg.task.family.observation]
-    parts = []
+    parts = {}
     if demo.path is None and expert.path is None and not has_player:
         most = expert.steps_on(cfg.task)
-        parts.append(f"player: at most {most:,} steps, about {_spell(most / rates['player'])}")
+        parts[f"player: at most {most:,} steps"] = most / rates["player"]
     fit = getattr(cfg, "fit", None)
     if isinstance(fit, FitConfig) and fit.steps:
-        seconds = fit.steps / rates["reward model"]
-        parts.append(f"reward model: {fit.steps:,} steps, about {_spell(seconds)}")
+        parts[f"reward model: {fit.steps:,} steps"] = fit.steps / rates["reward model"]
     if cfg.steps:
-        seconds = cfg.steps / rates["policy"]
-        parts.append(f"policy: {cfg.steps:,} steps, about {_spell(seconds)}")
-    return f"{'; '.join(parts)} (rough figures for one core, the bars below tell yours)"
+        parts[f"policy: {cfg.steps:,} steps"] = cfg.steps / rates["policy"]
+    return parts
 
 
 def announce(cfg: RunConfig, expert: ExpertConfig, demo: DemoConfig, *, has_player: bool) -> None:
-    """Prints :func:`outlook` to the terminal, where a part takes more than a minute."""
-    sentence = outlook(cfg, expert, demo, has_player=has_player)
-    if any(unit in sentence for unit in (" min", " h", " days")):
-        print(sentence, file=sys.stderr)
+    """Prints :func:`outlook` to the terminal, where a part takes 90 seconds or more."""
+    parts = outlook(cfg, expert, demo, has_player=has_player)
+    if max(parts.values(), default=0) >= 90:
+        told = "; ".join(f"{part}, about {_spell(seconds)}" for part, seconds in parts.items())
+        print(f"{told} (rough figures for one core, the bars below tell yours)", file=sys.stderr)
 
 
 def _spell(seconds: float) -> str:

@@ -12,7 +12,7 @@ import torch
 from safetensors.torch import save_file
 
 from giril_rl.errors import UserError
-from giril_rl.runs.checkpoint import load_state, restoring, save_state
+from giril_rl.runs.checkpoint import load_state, refusing_misfits, save_state
 
 
 def same(left, right):
@@ -187,7 +187,7 @@ def test_a_kill_at_any_moment_leaves_a_whole_checkpoint(tmp_path):
 def test_a_checkpoint_that_does_not_fit_is_named(error, tmp_path):
     with (
         pytest.raises(UserError, match=r"ppo\.safetensors cannot be restored \(\w+: .*\): if it"),
-        restoring(SimpleNamespace(folder=tmp_path), "ppo"),
+        refusing_misfits(SimpleNamespace(folder=tmp_path), "ppo"),
     ):
         raise error
 
@@ -195,6 +195,6 @@ def test_a_checkpoint_that_does_not_fit_is_named(error, tmp_path):
 def test_too_little_memory_is_not_the_checkpoints_fault(tmp_path):
     with (
         pytest.raises(torch.OutOfMemoryError, match="tried to allocate"),
-        restoring(SimpleNamespace(folder=tmp_path), "ppo"),
+        refusing_misfits(SimpleNamespace(folder=tmp_path), "ppo"),
     ):
         raise torch.OutOfMemoryError("tried to allocate 2 GiB")

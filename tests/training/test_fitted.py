@@ -16,7 +16,7 @@ from giril_rl.config.recipes import config_class, find
 from giril_rl.demos import Demonstration, shipped_demonstrations
 from giril_rl.errors import UserError
 from giril_rl.runs.identity import config_hash
-from giril_rl.training import demonstrations, players
+from giril_rl.training import demonstrations, experts
 from giril_rl.training.demonstrations import find_demonstration
 
 pytest.importorskip("ale_py")
@@ -107,7 +107,7 @@ def test_a_demonstration_or_an_expert_may_be_given_by_its_path(made, tmp_path):
 def test_a_relative_root_is_found_from_any_current_directory(made, tmp_path, monkeypatch, current):
     folder, cfg = made("giril")
     set_to(folder, "root", "study/mine")
-    made_by = config_hash(players.expert_settings(cfg, cfg.expert))
+    made_by = config_hash(experts.expert_settings(cfg, cfg.expert))
     place = demonstrations.demonstration_place(cfg, cfg.demo, made_by)
     Demonstration(transitions()).save(tmp_path / "study/mine" / place)
     (tmp_path / "giril").rename(tmp_path / "study/giril")
@@ -125,7 +125,7 @@ def test_a_relative_root_is_found_from_any_current_directory(made, tmp_path, mon
 def test_nothing_outside_the_folder_is_read(made, tmp_path, monkeypatch, key, kind):
     folder, cfg = made("giril")
     within, outside = tmp_path / "giril", tmp_path / "outside"
-    made_by = config_hash(players.expert_settings(cfg, cfg.expert))
+    made_by = config_hash(experts.expert_settings(cfg, cfg.expert))
     demo = outside
     if key == "expert.path":
         outside.mkdir()

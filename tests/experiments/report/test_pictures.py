@@ -22,7 +22,7 @@ from giril_rl.runs.finished import read_config, read_part, read_settings
 from giril_rl.runs.identity import config_hash
 from giril_rl.training import make_agent
 from giril_rl.training.demonstrations import demonstration_place
-from giril_rl.training.players import expert_settings
+from giril_rl.training.experts import expert_settings
 
 WORDS = ("task=breakout", "task.max_episode_steps=20")
 

@@ -13,7 +13,7 @@ from giril_rl.errors import UserError
 from giril_rl.experiments.study.plan import Planner
 from giril_rl.experiments.study.spec import find_study, read_spec, shipped_studies
 from giril_rl.runs.identity import config_hash, out_folder
-from giril_rl.training.players import expert_settings
+from giril_rl.training.experts import expert_settings
 
 
 def plan(name, *changes):
