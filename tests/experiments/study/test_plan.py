@@ -223,8 +223,8 @@ def test_shipped_studies_hold_what_they_say():
     # On 2 tasks with 3 seeds: own settings, 2 betas in 2 profiles, unscaled, I_c, 3 forms, numbers,
     # BC's, controls.
     assert counts["pybullet-ablations"] == 2 * 3 * (4 + 2 + 4 + 4 + 1 + 3 + 4 * 3 + 3 + 3 + 2)
-    # 3 experts on each of 2 tasks, the true reward; on 3 tasks with 3 seeds as above, and both forms
-    # of 2 methods.
+    # 3 experts on 2 tasks, the true reward; on 3 tasks with 3 seeds as above, both forms of 2
+    # methods.
     assert counts["pybullet-no-survival"] == 2 * 3 + 3 * 3 + 3 * 3 * (2 * 2 + 2 * 2 + 1 + 8)
     assert counts["atari-smoke"] == 6 * (1 + 5 + 5)
     # A fit of the recipe's own length would take hours on frames.
