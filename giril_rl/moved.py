@@ -140,8 +140,12 @@ def install() -> None:
         sys.meta_path.append(MovedModules())
 
 
-def renamed_argument(old: str, new: str) -> Callable[[Function], Function]:
-    """Lets a function take its argument ``new`` by its old name too, with a warning.
+def renamed_argument(old: str, new: str | None) -> Callable[[Function], Function]:
+    """Lets a function take an argument by its old name too, with a warning.
+
+    Args:
+        old: the old name.
+        new: the new one; None for an argument that is not read any more.
 
     Examples:
         >>> @renamed_argument("held_out", "validation")
@@ -159,8 +163,9 @@ def renamed_argument(old: str, new: str) -> Callable[[Function], Function]:
         @functools.wraps(function)
         def call(*args: Any, **kwargs: Any) -> Any:
             if old in kwargs:
-                _warn(f"{function.__name__}({old}=...)", f"{new}=")
-                kwargs[new] = kwargs.pop(old)
+                _warn(f"{function.__name__}({old}=...)", f"{new}=" if new else "not read")
+                value = kwargs.pop(old)
+                kwargs.update({new: value} if new else {})
             return function(*args, **kwargs)
 
         return cast(Function, call)

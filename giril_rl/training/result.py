@@ -10,6 +10,7 @@ from torch import nn
 from giril_rl.config.schema import AveragedRunConfig, DemoConfig, RewardRunConfig, RunConfig
 from giril_rl.demos import Demonstration
 from giril_rl.demos.shipped import demonstration_name
+from giril_rl.moved import renamed_argument
 from giril_rl.policies.agent import Agent
 from giril_rl.policies.making import POLICY
 from giril_rl.runs.curve import loss_points, write_curve, write_losses
@@ -40,6 +41,7 @@ CARD_KEYS = (
 """What of a result the cards of policy and reward repeat."""
 
 
+@renamed_argument("method", None)  # A run's method is the name of its recipe.
 def finish_run(
     run: Run,
     cfg: RunConfig,

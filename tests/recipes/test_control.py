@@ -51,8 +51,10 @@ def test_a_copy_is_a_method_of_its_own_and_has_no_profile_where_nothing_is_avera
     text = file.read_text()
     averaging = "*[BatchMeanReward()] * cfg.batch_mean,"
     assert averaging in text
+    text = text.replace("seeds=seeds", 'seeds=seeds, method="giril"')
     file.write_text(text.replace(averaging, ""))
-    result = run(str(file), tmp_path / "not_averaged", root)
+    with pytest.warns(DeprecationWarning, match=r"finish_run\(method=...\) is now not read"):
+        result = run(str(file), tmp_path / "not_averaged", root)
     assert (result["method"], result["profile"]) == ("mine", None)
     card = json.loads((tmp_path / "not_averaged" / "policy" / "card.json").read_text())
     assert (card["method"], card["profile"]) == ("mine", None)
