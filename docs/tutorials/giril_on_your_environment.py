@@ -6,7 +6,7 @@ and scores on the true reward, which nothing before has read. A constant reward 
 well: what it reaches needed no demonstration.
 
 What to expect: with either reward the ball stays on the beam, with the constant one in the middle
-and with GIRIL's near an end, for GIRIL pays for what its model foresees badly.
+and with GIRIL's near an end, for GIRIL pays for what its model predicts badly.
 
     python docs/tutorials/giril_on_your_environment.py --steps 60000
 
@@ -113,7 +113,7 @@ def generative_reward(demo: Demonstration, fit_steps: int) -> GenerativeReward:
 
 
 # 4. PPO on a reward: what the recipes do. The reward is put in the true one's place on each batch,
-#    and divided by the running deviation of its return.
+#    and divided by the running standard deviation of its return.
 
 
 def train(reward, folder: Path, steps: int, seed: int = 0):

@@ -2,7 +2,7 @@
 
 A reward is a TensorDictModule that reads a transition and writes ("next", "intrinsic_reward"), one
 value for each. The one below needs no training: it keeps the demonstration's states and pays
-exp(-d) for the distance d of the next state to the nearest one, in units of their deviation.
+exp(-d) for the distance d of the next state to the nearest one, in their standard deviations.
 `check_reward` holds it to what is asked of every reward, and PPO maximises it. Afterwards the
 policy is scored beside one that got a constant reward.
 

@@ -216,10 +216,12 @@ class BCConfig:
     )
     lr: float = knob(3e-3, "AdamW step size, decreasing linearly to zero", low=0, low_open=True)
     weight_decay: float = knob(1.0, "AdamW's weight decay, times the step size", low=0)
-    min_scale: float = knob(0.07, "smallest deviation that observations are divided by", low=0)
+    min_scale: float = knob(
+        0.07, "smallest standard deviation that observations are divided by", low=0
+    )
     min_std: float = knob(
         0.01,
-        "Box: smallest deviation of sampled actions, in units of half their range",
+        "Box: smallest standard deviation of sampled actions, in units of half their range",
         low=0,
         low_open=True,
     )
@@ -243,7 +245,7 @@ class BCConfig:
 
 @dataclass
 class ScalingConfig:
-    """Division of rewards by the running deviation of their discounted return."""
+    """Division of rewards by the running standard deviation of their discounted return."""
 
     enabled: bool = knob(True, "scale the reward")
     reset: str = knob(

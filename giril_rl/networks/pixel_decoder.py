@@ -26,9 +26,8 @@ class PixelDecoder(nn.Module):
     activation. The 6x6 layer is the released code's: the paper's table does not reach 84x84, nor
     four channels.
 
-    As the state enters at the last layer only, ``decoder(encoding, s)`` equals
-    ``code_part(encoding) + state_part(s)``. For a one-hot ``a`` that is
-    ``action_table()[a] + state_part(s)``.
+    As the state enters at the last layer only, ``decoder(encoding, s)`` is ``code_part(encoding)``
+    plus a convolution of ``s`` alone. For a one-hot ``a`` the former is ``action_table()[a]``.
 
     Args:
         actions: number of actions, the size of the encoding.
@@ -107,11 +106,6 @@ class PixelDecoder(nn.Module):
         """
         half = self.last.weight[:, : self.channels]
         return F.conv2d(self.image(encoding), half, self.last.bias, padding=2, dilation=2)
-
-    def state_part(self, observation: Tensor) -> Tensor:
-        """What observations ``(*batch, channels, 84, 84)`` add to the prediction, same shape."""
-        frames = flat_frames(observation, self.channels)
-        return F.conv2d(frames, self.state_weight, padding=2, dilation=2).reshape(observation.shape)
 
 
 class ChannelsLast(nn.Unflatten):

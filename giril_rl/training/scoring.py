@@ -179,8 +179,8 @@ def evaluate_both(
     """Scores of the policy as it was trained, sampling; of its mode under ``"deterministic"``.
 
     The first are what tables quote: PPO maximises the return of the sampling policy, and the
-    paper's curves are of its training episodes. Where actions keep a deviation near 1, the mode is
-    a policy that was never tried. The entries are those of :class:`Scores`.
+    paper's curves are of its training episodes. Where actions keep a standard deviation near 1, the
+    mode is a policy that was never tried. The entries are those of :class:`Scores`.
     """
     scores = {
         deterministic: evaluate(
