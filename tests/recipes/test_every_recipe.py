@@ -192,7 +192,12 @@ def test_a_finished_command_does_not_train_again(root, tmp_path, monkeypatch, ca
     assert again.err == f"giril: {tmp_path} was finished earlier: nothing was run.\n"
 
 
-@pytest.mark.parametrize("recipe", EXTRA)
+QUICK = ("giril", "gail")  # A reward trained before the policy, and one beside it.
+
+
+@pytest.mark.parametrize(
+    "recipe", [r if r in QUICK else pytest.param(r, marks=pytest.mark.slow) for r in EXTRA]
+)
 def test_a_run_follows_from_its_seed(recipe, root, tmp_path):
     results = {}
     for number, (name, seed) in enumerate((("one", 0), ("two", 0), ("three", 1))):
