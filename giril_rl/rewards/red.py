@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import cast
+from dataclasses import dataclass, replace
 
 import torch
+from scipy.optimize import brentq
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
@@ -23,7 +23,7 @@ from giril_rl.errors import UserError
 from giril_rl.networks.pixels import FEATURES, PixelFeatures
 from giril_rl.networks.vectors import mlp
 from giril_rl.rewards.actions import ActionEncoder
-from giril_rl.rewards.fitting import Reduction, TransitionLoss
+from giril_rl.rewards.fitting import TransitionLoss
 from giril_rl.rewards.method import GREY, Method, register
 from giril_rl.rewards.scaler import ObservationScaler, PixelScaler, ScalingRule
 from giril_rl.rewards.transitions import (
@@ -31,10 +31,11 @@ from giril_rl.rewards.transitions import (
     REWARD_KEYS,
     TransitionReward,
     check_transitions,
-    observation_shape,
+    per_transition,
+    reward_for,
 )
 from giril_rl.runs.pretrained import Pretrained, remembered
-from giril_rl.runs.randomness import seeded, stream_seed
+from giril_rl.runs.randomness import seeded
 
 
 @dataclass
@@ -63,6 +64,16 @@ class DistillationConfig:
     seed: int | None = knob(None, "seed of the reward model; null takes the run's seed", low=0)
 
 
+def distillation_error(predicted: Tensor, target: Tensor) -> Tensor:
+    """``||f - g||^2``, summed over the last dimension: the loss, and what the reward falls with.
+
+    Examples:
+        >>> distillation_error(torch.tensor([[1.0, 2.0]]), torch.tensor([[0.0, 1.0]]))
+        tensor([2.])
+    """
+    return (predicted - target).square().sum(-1)
+
+
 def distillation_reward(predicted: Tensor, target: Tensor, sigma: Tensor | float) -> Tensor:
     """``exp(-sigma * ||f - g||^2)``, summed over the last dimension (Wang et al., 2019).
 
@@ -76,7 +87,7 @@ def distillation_reward(predicted: Tensor, target: Tensor, sigma: Tensor | float
         >>> distillation_reward(f, g, 0.5)
         tensor([1.0000, 0.3679])
     """
-    return (-sigma * (predicted - target).square().sum(-1)).exp()
+    return (-sigma * distillation_error(predicted, target)).exp()
 
 
 class DistillationReward(Pretrained, TransitionReward):
@@ -220,8 +231,8 @@ class DistillationReward(Pretrained, TransitionReward):
             demo_reward: their mean reward, in (0, 1).
 
         Raises:
-            UserError: if f predicts g without any error on ``pairs``, or ``demo_reward`` is outside
-                (0, 1).
+            UserError: if f predicts g without error on too many of ``pairs``, or ``demo_reward`` is
+                outside (0, 1).
 
         Examples:
             >>> from tensordict import TensorDict
@@ -238,20 +249,22 @@ class DistillationReward(Pretrained, TransitionReward):
             raise UserError(f"demo_reward={demo_reward} is outside (0, 1): give one such as 0.9.")
         device = self.sigma.device
         entries = [pairs.get(key).to(device) for key in self.in_keys]
-        self.sigma.fill_(1.0)
-        error = -self.values(*entries).double().log()
-        if not (error.isfinite().all() and error.max() > 0):
+        error = per_transition(
+            lambda *pair: distillation_error(*self.outputs(*pair)),
+            tuple(entries),
+            self.scaler.event_dims,
+        ).double()
+
+        def excess(log_sigma: float) -> float:
+            return (-math.exp(log_sigma) * error).exp().mean().item() - demo_reward
+
+        try:
+            self.sigma.fill_(math.exp(brentq(excess, -60, 60)))
+        except ValueError:  # No sigma in 1e-26 to 1e26.
             raise UserError(
-                "RED's network predicts the demonstration without any error, or without bound: set "
-                "reward.sigma."
-            )
-        # The mean reward falls as sigma grows: bisection in its logarithm.
-        low, high = -60.0, 60.0
-        for _ in range(100):
-            middle = (low + high) / 2
-            reward = (-math.exp(middle) * error).exp().mean().item()
-            low, high = (middle, high) if reward > demo_reward else (low, middle)
-        self.sigma.fill_(math.exp((low + high) / 2))
+                f"no sigma gives the demonstration a mean reward of {demo_reward}, for RED's "
+                "network predicts too much of it without any error: set reward.sigma."
+            ) from None
 
 
 class _PixelNetwork(nn.Module):
@@ -284,15 +297,6 @@ class DistillationLoss(TransitionLoss):
 
     reward: DistillationReward
 
-    def __init__(
-        self,
-        reward: DistillationReward,
-        *,
-        reduction: Reduction = "mean",
-        functional: bool = False,
-    ) -> None:
-        super().__init__(reward, reduction=reduction, functional=functional)
-
     @property
     def out_keys(self) -> list[NestedKey]:
         """The name of the term."""
@@ -302,8 +306,7 @@ class DistillationLoss(TransitionLoss):
         """The squared error of each transition."""
         reward = self.reward
         check_transitions(reward.scaler, reward.actions, observation, action)
-        predicted, target = reward.outputs(observation, action)
-        return ((predicted - target).square().sum(-1),)
+        return (distillation_error(*reward.outputs(observation, action)),)
 
 
 def red_reward(
@@ -324,23 +327,9 @@ def red_reward(
         >>> red_reward(DistillationConfig(), GymEnv("CartPole-v1"), pairs, seed=0).scaler
         ObservationScaler(4, rule='standardise', clamp=True)
     """
-    frames, size = observation_shape(env)
-    seed, sigma = stream_seed("reward", seed), settings.sigma or 1.0
-    if frames:
-        reward = DistillationReward.for_pixels(
-            env.action_spec, channels=frames, features=settings.features, sigma=sigma, seed=seed
-        )
-    else:
-        reward = DistillationReward.for_vectors(
-            size,
-            env.action_spec,
-            hidden=settings.hidden,
-            features=settings.features,
-            sigma=sigma,
-            normalise=cast(ScalingRule, settings.normalise),
-            clamp=settings.clamp,
-            seed=seed,
-        )
+    settings = replace(settings, sigma=settings.sigma or 1.0)  # Until it is calibrated.
+    shared, own = "features sigma", "hidden normalise clamp"
+    reward = reward_for(env, DistillationReward, settings, seed=seed, of_all=shared, of_vectors=own)
     reward.scaler.fit(pairs.get("observation"))
     return reward
 
