@@ -28,8 +28,8 @@ from giril_rl.rewards.transitions import REWARD_KEYS
 from giril_rl.runs.pretrained import remembered
 
 Cost = Literal["euclidean", "cosine"]
-LOG_EVERY = 10
-"""One Sinkhorn step in so many is made in the log domain."""
+FAR = 1e50
+"""The factor of a row or column beyond which a Sinkhorn step is made in the log domain."""
 
 
 @dataclass
@@ -72,10 +72,10 @@ def pairwise_cost(x: Tensor, y: Tensor, cost: Cost = "euclidean") -> Tensor:
 def sinkhorn_plan(cost: Tensor, regularisation: float, iterations: int = 100) -> Tensor:
     """The transport plan of Sinkhorn's algorithm between two uniform distributions.
 
-    Rows add up to ``1 / L`` exactly; columns to ``1 / n`` as far as it has converged. Most steps
-    scale the kernel ``exp(-cost / regularisation)`` itself, which is 20 times as fast as the log
-    domain. One step in 10 is made in the log domain, from which the kernel is computed anew
-    (Schmitzer 2019): nothing under- or overflows, for a step changes a factor by ``L n`` at most.
+    Rows add up to ``1 / L`` exactly; columns to ``1 / n`` as far as it has converged. The first
+    step is made in the log domain, where nothing under- or overflows. The others multiply rows and
+    columns of the plan so far, which is some 100 times as fast, until a factor grows too large for
+    that: then comes another step in the log domain (Schmitzer 2019).
 
     Args:
         cost: float64 ``(L, n)``.
@@ -95,9 +95,9 @@ def sinkhorn_plan(cost: Tensor, regularisation: float, iterations: int = 100) ->
     u, v = torch.ones_like(f[:, 0]), torch.ones_like(g)
     kernel = log_kernel
     for step in range(iterations):
-        if step % LOG_EVERY == 0:
+        if not step or max(u.max(), 1 / u.min(), v.max(), 1 / v.min()) > FAR:
             f = f + u.log().unsqueeze(1)
-            g = math.log(columns) - torch.logsumexp(log_kernel + f, 0)
+            g = math.log(columns) - torch.logsumexp(log_kernel + f, 0)  # Takes v over as well.
             f = math.log(rows) - torch.logsumexp(log_kernel + g, 1, keepdim=True)
             kernel = (log_kernel + f + g).exp()
             u, v = torch.ones_like(u), torch.ones_like(v)
@@ -167,7 +167,9 @@ class SinkhornReward(TrajectoryReward):
 
     whole_episodes: ClassVar[bool] = True
     episode_state: ClassVar[tuple[str, ...]] = (
-        *TrajectoryReward.episode_state, "history", "length"
+        *TrajectoryReward.episode_state,
+        "history",
+        "length",
     )
 
     history: Tensor

@@ -105,7 +105,7 @@ class TrajectoryReward(Pretrained, TensorDictModuleBase):
         )
         check_states(observation, following)
         vectors = self.atoms(observation, *action)
-        if not tensordict.numel():
+        if 0 in tensordict.shape:
             return tensordict.set(self.out_keys[0], vectors.new_zeros(*tensordict.shape, 1).float())
         onward, episode = (tensordict.get(key, None) for key in self.optional_keys)
         if onward is not None:

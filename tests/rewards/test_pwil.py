@@ -130,11 +130,15 @@ def test_no_time_limit_no_actions_and_images_are_refused():
     env._limit = None
     with pytest.raises(UserError, match=r"no time limit: set reward\.horizon\.$"):
         pwil_reward(PWILConfig(), env, pairs())
-    with pytest.raises(UserError, match=r"demonstration has none: set reward\.use_actions=false\.$"):
+    with pytest.raises(
+        UserError, match=r"demonstration has none: set reward\.use_actions=false\.$"
+    ):
         pwil_reward(PWILConfig(horizon=5), env, pairs().exclude("action"))
     reward = pwil_reward(PWILConfig(horizon=5, use_actions=False), env, pairs().exclude("action"))
     assert reward.atoms.points.shape == (9, 4)
-    with pytest.raises(UserError, match=r"^the demonstration's observation is nan at index \[1, 0\]"):
+    with pytest.raises(
+        UserError, match=r"^the demonstration's observation is nan at index \[1, 0\]"
+    ):
         wrong = pairs()
         wrong["observation"][1, 0] = torch.nan
         pwil_reward(PWILConfig(horizon=5), env, wrong)
@@ -145,7 +149,9 @@ def test_used_before_it_has_seen_a_demonstration():
     fresh = type(reward)(2, SPEC, atoms=5, horizon=5)
     with pytest.raises(UserError, match=r"has not seen a demonstration: call reward\.fit"):
         fresh(walk(1, 3))
-    with pytest.raises(UserError, match=r"made for a demonstration of 5 transitions, not for \(6,\)"):
+    with pytest.raises(
+        UserError, match=r"made for a demonstration of 5 transitions, not for \(6,\)"
+    ):
         fresh.fit(demonstration(6))
 
 
