@@ -95,27 +95,35 @@ def greedy_coupling(
     """
     left, atoms = left.clone(), left.shape[1]
     least = -(-int(demand.max()) // full)  # Atoms that a step needs at least.
+    whole = full == 1  # Every move takes a whole atom, which needs less bookkeeping.
     nothing, never = distance.new_zeros(()), distance.new_tensor(torch.inf)
     used = torch.where(left == 0, never, nothing)
+    asked = demand.unsqueeze(-1)
+    emptied, one = torch.where(asked > 0, never, nothing), (asked > 0).long()
     steps: list[int] = []
     moves: list[Tensor] = []
     for t, restart in enumerate(ends.any(1).tolist()):
-        near, missing = distance[t] + used, demand[t].unsqueeze(-1)
+        near, missing = distance[t] + used, asked[t]
         for count in range(1, atoms + 1):
             nearest = near.min(1, keepdim=True).indices
-            there = left.gather(1, nearest)
-            taken = torch.minimum(there, missing)
-            left.scatter_add_(1, nearest, -taken)
-            used.scatter_(1, nearest, torch.where(taken == there, never, nothing))
-            missing = missing - taken
+            if whole:
+                taken = one[t]
+                used.scatter_add_(1, nearest, emptied[t])
+            else:
+                there = left.gather(1, nearest)
+                taken = torch.minimum(there, missing)
+                left.scatter_add_(1, nearest, -taken)
+                used.scatter_(1, nearest, torch.where(taken == there, never, nothing))
+                missing = missing - taken
             steps.append(t)
             moves += nearest, taken
-            if count >= least and not missing.any():
+            if count >= least and (whole or not missing.any()):
                 break
             near.scatter_(1, nearest, torch.inf)
         if restart:
             left[ends[t]], used[ends[t]] = full, 0.0
     done = torch.cat(moves, 1).T
+    left = (used == 0).long() if whole else left
     return torch.tensor(steps, device=left.device), done[::2], done[1::2], left
 
 
@@ -220,8 +228,10 @@ class PWILReward(TrajectoryReward):
         moved = taken * (x[step] - points[atom]).norm(dim=-1)
         total = self.full * len(points)
         cost = moved.new_zeros(paid.shape).index_add_(0, step, moved) / total
-        scale = {"alpha": self.alpha, "beta": self.beta, "horizon": self.horizon}
-        return torch.where(paid, pwil_value(cost, size=points.shape[1], **scale), 0.0).T
+        value = pwil_value(
+            cost, alpha=self.alpha, beta=self.beta, horizon=self.horizon, size=points.shape[1]
+        )
+        return torch.where(paid, value, 0.0).T
 
     def _played(self, ends: Tensor) -> Tensor:
         """Steps ``(T, N)`` that each episode had before."""
