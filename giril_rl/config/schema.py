@@ -18,6 +18,7 @@ from giril_rl.errors import UserError
 from giril_rl.moved import forwarding
 
 MOST_THREADS = 1024
+USE_ACTIONS = "read actions; false reads states alone, as a demonstration without actions needs"
 COMPILE = "torch.compile of gradient steps: for long training on frames, 20 seconds to begin"
 
 
