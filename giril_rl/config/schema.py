@@ -342,26 +342,31 @@ class DemoRunConfig(RunConfig):
 
     @property
     def needs_actions(self) -> str | None:
-        """What a demonstration without actions cannot be used for, and what to do; else None."""
-        reward, sac = getattr(self, "reward", None), getattr(self, "sac", None)
-        return needs_actions("reward", reward) or (
-            _needs_replayed(sac) if getattr(self, "algorithm", None) == "sac" else None
-        )
+        """What reads the demonstration's actions, and what to set if it has none; None: nothing."""
+        return self.reward_needs_actions or _replay_needs_actions(self)
+
+    @property
+    def reward_needs_actions(self) -> str | None:
+        """The same of the reward alone, or of the policy where there is no reward."""
+        return needs_actions("reward", getattr(self, "reward", None))
 
 
 def needs_actions(name: str, reward: object) -> str | None:
-    """For the settings of a reward under the key ``name``."""
+    """What of a reward's settings, under the key ``name``, reads actions, and what to set.
+
+    Examples:
+        >>> needs_actions("reward", None)
+        'this recipe learns from: give one that has them, or take another recipe'
+    """
     uses = getattr(reward, "use_actions", None)
     if uses is None:
         return "this recipe learns from: give one that has them, or take another recipe"
-    if uses:
-        return f"{name}.use_actions=true reads: set {name}.use_actions=false"
-    return None
+    return f"{name}.use_actions=true reads: set {name}.use_actions=false" if uses else None
 
 
-def _needs_replayed(sac: object) -> str | None:
-    chosen = getattr(sac, "demonstration", "none")
-    if chosen == "none":
+def _replay_needs_actions(run: object) -> str | None:
+    chosen = getattr(getattr(run, "sac", None), "demonstration", "none")
+    if getattr(run, "algorithm", None) != "sac" or chosen == "none":
         return None
     return f"sac.demonstration={chosen} puts into the replay: set sac.demonstration=none"
 

@@ -87,7 +87,8 @@ def check_environment(demo: Demonstration, task: TaskConfig) -> None:
     recorded = demo.card.get("env_id")
     if isinstance(recorded, str) and _unversioned(recorded) != _unversioned(task.env_id):
         raise UserError(
-            f"the demonstration is of {recorded} and not of {task.env_id}: use one of this task."
+            f"the demonstration is of {recorded} and not of {task.env_id}: use one of this task, "
+            "or, if the two are one environment, take env_id out of its card.json."
         )
 
 

@@ -186,7 +186,9 @@ def _whole(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
             "the episode ended by itself."
         )
     total, count = sum(lengths.tolist()), len(lengths)
-    rows = {name: arrays[name] for name in ("actions", "rewards") if name in arrays}
+    rows: dict[str, np.ndarray] = {
+        name: arrays[name] for name in ("actions", "rewards") if name in arrays
+    }
     wanted_rows = {"observations": total + count, **dict.fromkeys(rows, total)}
     for name, wanted in wanted_rows.items():
         found = len(arrays[name]) if arrays[name].ndim else 0

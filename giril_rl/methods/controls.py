@@ -58,7 +58,7 @@ class ControlRunConfig(AveragedRunConfig):
         return self.method.demonstration
 
     @property
-    def needs_actions(self) -> str | None:
+    def reward_needs_actions(self) -> str | None:
         """What of the control reads the demonstration's actions; the copy reads none."""
         for part in ("giril", "icm"):
             settings = getattr(self, part)
