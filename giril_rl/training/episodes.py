@@ -95,6 +95,7 @@ class HeldEpisodes:
     def __init__(self) -> None:
         self._held: TensorDictBase | None = None
         self._begins: list[int] = []
+        self._onward = torch.zeros(0)
 
     def add(self, batch: TensorDictBase) -> list[TensorDictBase]:
         """Takes a batch ``(num_envs, time)``; gives the episodes that end in it, ``(1, length)``.
@@ -105,10 +106,13 @@ class HeldEpisodes:
         if self._held is None:
             self._held, self._begins = batch, [0] * batch.shape[0]
         else:
-            moved = (batch.get("observation")[:, 0] != _onward(self._held)[:, -1]).flatten(1).any(1)
+            moved = (batch.get("observation")[:, 0] != self._onward).flatten(1).any(1)
             for index in moved.nonzero().flatten().tolist():
                 self._begins[index] = before
             self._held = torch.cat([self._held, batch], 1)
+        onward = batch.get(("next", "following_observation"), None)
+        onward = batch.get(("next", "observation")) if onward is None else onward
+        self._onward = onward[:, -1].clone()
         episodes = []
         for index, step in batch.get(("next", "done")).squeeze(-1).nonzero().tolist():
             end = before + step + 1
@@ -124,7 +128,12 @@ class HeldEpisodes:
         if self._held is None:
             return {}
         columns = dict(self._held.flatten_keys(".").items())
-        return {"begins": self._begins, "columns": columns, "shape": list(self._held.shape)}
+        return {
+            "begins": self._begins,
+            "columns": columns,
+            "shape": list(self._held.shape),
+            "onward": self._onward,
+        }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restores what :meth:`state_dict` gave."""
@@ -132,10 +141,4 @@ class HeldEpisodes:
             self._held, self._begins = None, []
             return
         self._held = TensorDict(state["columns"], state["shape"]).unflatten_keys(".")
-        self._begins = list(state["begins"])
-
-
-def _onward(batch: TensorDictBase) -> Tensor:
-    """Where each step leads, behind an unnoticed reset as well."""
-    onward = batch.get(("next", "following_observation"), None)
-    return batch.get(("next", "observation")) if onward is None else onward
+        self._begins, self._onward = list(state["begins"]), state["onward"]

@@ -193,7 +193,7 @@ def test_episodes_that_are_held_back_are_stored_whole_once_they_end():
     data = env.rollout(160, sac.act(), break_when_any_done=False)
     for part in data.split(8, 1):
         sac.update(part)
-    assert sum(episode.numel() for episode in seen) == len(sac.replay) > 400
+    assert sum(episode.numel() for episode in seen) == sac.replay.written > 400
     for episode in seen:
         done = episode["next", "done"][0, :, 0]
         assert done[-1] and not done[:-1].any()
@@ -201,7 +201,7 @@ def test_episodes_that_are_held_back_are_stored_whole_once_they_end():
         assert not episode["next", "reward"].any()  # The true one, which is 1.
     ended = data["next", "done"].squeeze(-1)
     left = [160 - (int(row.nonzero()[-1]) + 1) for row in ended]
-    assert data.numel() - len(sac.replay) == sum(left)
+    assert data.numel() - sac.replay.written == sum(left)
 
 
 def test_gradient_steps_are_as_many_as_asked(tmp_path):
