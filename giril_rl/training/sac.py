@@ -103,7 +103,9 @@ class SAC:
         self.agent, self.cfg = agent, cfg
         self.num_envs, self.log_every = cfg.num_envs, cfg.log_every
         self.frames_per_batch = cfg.num_envs * cfg.rollout
-        self._slack = max(cfg.buffer_size // 4, 2 * self.frames_per_batch)
+        # Whole episodes come many transitions at a time.
+        share = 4 if relabel_episodes is None else 1
+        self._slack = max(cfg.buffer_size // share, 2 * self.frames_per_batch)
         self.checkpoint_every = min(cfg.checkpoint_every, self._slack - self.frames_per_batch)
         self.steps = cfg.whole_batches(steps)
         self.bootstraps_failure = termination == "bootstrap"
