@@ -220,8 +220,10 @@ class PWILReward(TrajectoryReward):
         moved = taken * (x[step] - points[atom]).norm(dim=-1)
         total = self.full * len(points)
         cost = moved.new_zeros(paid.shape).index_add_(0, step, moved) / total
-        scale = {"alpha": self.alpha, "beta": self.beta, "horizon": self.horizon}
-        return torch.where(paid, pwil_value(cost, size=points.shape[1], **scale), 0.0).T
+        value = pwil_value(
+            cost, alpha=self.alpha, beta=self.beta, horizon=self.horizon, size=points.shape[1]
+        )
+        return torch.where(paid, value, 0.0).T
 
     def _played(self, ends: Tensor) -> Tensor:
         """Steps ``(T, N)`` that each episode had before."""
