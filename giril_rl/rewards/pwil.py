@@ -18,7 +18,7 @@ from torch import Tensor
 from torchrl.data import TensorSpec
 from torchrl.envs import EnvBase
 
-from giril_rl.config.schema import knob
+from giril_rl.config.schema import USE_ACTIONS, knob
 from giril_rl.errors import UserError
 from giril_rl.rewards.atoms import Atoms, check_vectors, spaces_of
 from giril_rl.rewards.method import SKY, Method, register
@@ -39,7 +39,7 @@ class PWILConfig:
     horizon: int | None = knob(
         None, "steps of an episode that are paid for, T; null takes the task's time limit", low=1
     )
-    use_actions: bool = knob(True, "compare states and actions rather than states alone")
+    use_actions: bool = knob(True, USE_ACTIONS)
 
     def check(self, prefix: str, run: Any) -> None:
         """Refuses frames, before anything is trained."""

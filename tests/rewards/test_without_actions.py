@@ -30,6 +30,7 @@ STATES_ALONE = [
     for name, method in methods().items()
     if method.kind == "method"
     and method.build is not None
+    and not method.along_time  # Those have tests of their own.
     and "use_actions" in [field.name for field in fields(method.settings)]
 ]
 NETWORKS = {"normalise": "pixels"}
