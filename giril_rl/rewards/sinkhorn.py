@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any, ClassVar, Literal, cast
+from dataclasses import asdict, dataclass
+from typing import Any, ClassVar, Literal
 
 import torch
 import torch.nn.functional as F
@@ -116,8 +116,7 @@ def sinkhorn_value(cost: Tensor, regularisation: float = 0.01, iterations: int =
         iterations: Sinkhorn steps.
 
     Examples:
-        Both steps lie at the demonstration's first; half of the weight has to go to its second, at
-        a cost of 3:
+        Both steps lie at the first of two demonstrated ones; half of each goes to the second:
 
         >>> sinkhorn_value(torch.tensor([[0.0, 3.0], [0.0, 3.0]]))
         tensor([-0.7500, -0.7500], dtype=torch.float64)
@@ -131,10 +130,9 @@ def sinkhorn_value(cost: Tensor, regularisation: float = 0.01, iterations: int =
 class SinkhornReward(TrajectoryReward):
     """Sinkhorn's reward, at most 0, of a whole episode.
 
-    It is known at an episode's end. Step by step, and on batches that follow time, the last step is
-    paid the episode's sum and all others 0. Within
-    :meth:`~giril_rl.rewards.trajectory.TrajectoryReward.fresh_episodes`, where batches hold whole
-    episodes, each step is paid its own share.
+    It is known at an episode's end: the last step is paid the episode's sum and all others 0.
+    Within :meth:`~giril_rl.rewards.trajectory.TrajectoryReward.fresh_episodes`, where batches hold
+    whole episodes, each step is paid its own share.
 
     Give it the demonstration by :meth:`fit`.
 
@@ -259,11 +257,9 @@ class SinkhornReward(TrajectoryReward):
         return self.scale * value
 
     def extra_repr(self) -> str:
-        """Shows cost, regularisation, iterations and scale when printed."""
-        return (
-            f"cost={self.cost!r}, regularisation={self.regularisation}, "
-            f"iterations={self.iterations}, scale={self.scale.item():g}"
-        )
+        """Shows cost, regularisation and scale when printed."""
+        reg, scale = self.regularisation, self.scale.item()
+        return f"cost={self.cost!r}, regularisation={reg}, scale={scale:g}"
 
 
 def sinkhorn_reward(
@@ -288,16 +284,9 @@ def sinkhorn_reward(
         >>> sinkhorn_reward(SinkhornConfig(), GymEnv("CartPole-v1"), pairs).cost
         'euclidean'
     """
-    reward = SinkhornReward(
-        *spaces_of("Sinkhorn", env, settings.use_actions),
-        atoms=len(pairs),
-        cost=cast(Cost, settings.cost),
-        regularisation=settings.regularisation,
-        iterations=settings.iterations,
-        scale=settings.scale,
-        first_return=settings.first_return,
-    )
-    return reward.fit(pairs)
+    more = asdict(settings)
+    spaces = spaces_of("Sinkhorn", env, more.pop("use_actions"))
+    return SinkhornReward(*spaces, atoms=len(pairs), **more).fit(pairs)
 
 
 register(

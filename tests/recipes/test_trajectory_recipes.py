@@ -11,10 +11,15 @@ from giril_rl.rewards import PWILReward, SinkhornReward
 
 TINY = (
     *("task.env_id=CartPole-v1", "steps=320", "eval.episodes=2", "logger=null"),
-    *("expert.steps=2000", "demo.length=60", "sac.num_envs=2", "sac.rollout=8", "sac.batch=8"),
-    *("sac.hidden=[8]", "sac.random_steps=64", "sac.log_every=16", "sac.checkpoint_every=48"),
-    *("ppo.num_envs=2", "ppo.rollout=16", "ppo.minibatch=16", "ppo.epochs=1", "ppo.hidden=[8]"),
-    *("ppo.checkpoint_every=96",),
+    *("expert.steps=2000", "demo.length=60"),
+)
+SAC = (
+    *("sac.num_envs=2", "sac.rollout=8", "sac.batch=8", "sac.hidden=[8]", "sac.random_steps=64"),
+    *("sac.log_every=16", "sac.checkpoint_every=48"),
+)
+PPO = (
+    *("algorithm=ppo", "ppo.num_envs=2", "ppo.rollout=16", "ppo.minibatch=16", "ppo.epochs=1"),
+    *("ppo.hidden=[8]", "ppo.checkpoint_every=96"),
 )
 REWARDS = {"pwil": PWILReward, "sinkhorn": SinkhornReward}
 
@@ -26,22 +31,35 @@ def root(tmp_path_factory):
 
 
 def run(recipe, out, root, *more):
-    return main(["run", recipe, f"out={out}", f"root={root}", *TINY, *more])
+    learner = () if "algorithm=ppo" in more else SAC
+    return main(["run", recipe, f"out={out}", f"root={root}", *TINY, *learner, *more])
 
 
-@pytest.mark.parametrize("more", [(), ("algorithm=ppo",), ("reward.use_actions=false",)])
-def test_pwil_stopped_in_mid_episode_ends_as_an_undisturbed_run(more, root, tmp_path):
-    assert run("pwil", tmp_path / "whole", root, *more) == 0
+@pytest.mark.parametrize(
+    ("recipe", "more"),
+    [
+        ("pwil", ()),
+        ("pwil", PPO),
+        ("sinkhorn", ()),
+        ("sinkhorn", PPO),
+    ],
+)
+def test_a_run_stopped_in_mid_episode_ends_as_an_undisturbed_one(recipe, more, root, tmp_path):
+    assert run(recipe, tmp_path / "whole", root, *more) == 0
     for step in (112, 208):
         with stopped(Killed, step):
-            if run("pwil", tmp_path / "cut", root, *more) != 0:
+            if run(recipe, tmp_path / "cut", root, *more) != 0:
                 raise Killed  # The command had turned it into an exit status.
-    assert run("pwil", tmp_path / "cut", root, *more) == 0
+    assert run(recipe, tmp_path / "cut", root, *more) == 0
     assert rows(tmp_path / "cut") == rows(tmp_path / "whole")
     assert weights(tmp_path / "cut") == weights(tmp_path / "whole")
-    reward = PWILReward.from_pretrained(tmp_path / "whole/reward")
+
+
+def test_the_shared_reward_is_that_of_the_task_without_running_episodes(root, tmp_path):
+    assert run("pwil", tmp_path / "run", root, "reward.use_actions=false") == 0
+    reward = PWILReward.from_pretrained(tmp_path / "run/reward")
     assert reward.horizon == 500 and len(reward.running) == 0
-    assert reward.atoms.points.shape == (60, 4 if "reward.use_actions=false" in more else 6)
+    assert reward.atoms.points.shape == (60, 4)
 
 
 @pytest.mark.parametrize("recipe", REWARDS)
