@@ -106,7 +106,7 @@ def make_algorithm(
 
     Raises:
         UserError: if the algorithm has no form for the environment's spaces, or the replay buffer
-            is smaller than the demonstration.
+            cannot hold the demonstration.
     """
     termination = getattr(cfg, "termination", "ends")
     if cfg.algorithm == "ppo":
@@ -130,6 +130,26 @@ def make_algorithm(
     )
 
 
+def check_replay(cfg: RunConfig, demo: Demonstration) -> None:
+    """Refuses a demonstration that cannot be put into SAC's replay buffer, where it is to be.
+
+    Raises:
+        UserError: if it has no actions, or more transitions than ``sac.buffer_size``.
+    """
+    if cfg.algorithm != "sac" or cfg.sac.demonstration == "none":
+        return
+    if not demo.has_actions:
+        raise UserError(
+            f"the demonstration has no actions, which sac.demonstration={cfg.sac.demonstration} "
+            "puts into the replay: set sac.demonstration=none."
+        )
+    if len(demo) > cfg.sac.buffer_size:
+        raise UserError(
+            f"sac.buffer_size={cfg.sac.buffer_size} is less than the demonstration's {len(demo):,} "
+            "transitions: give the buffer more room, or set sac.demonstration=none."
+        )
+
+
 def _scaling(cfg: ScalingConfig, gamma: float) -> ReturnScaling | None:
     if not cfg.enabled:
         return None
@@ -144,11 +164,7 @@ def _demonstrated(
     reward: float | None,
 ) -> TensorDictBase:
     """The demonstration's transitions, flat, with the reward to learn from."""
-    if len(demo) > cfg.sac.buffer_size:
-        raise UserError(
-            f"sac.buffer_size={cfg.sac.buffer_size} is less than the demonstration's {len(demo):,} "
-            "transitions: give the buffer more room, or set sac.demonstration=none."
-        )
+    check_replay(cfg, demo)
     known = demo.transitions.unsqueeze(0).to(cfg.device)
     if reward is not None:
         shape = known.get(("next", "done")).shape
