@@ -43,6 +43,7 @@ class Method:
             trained.
         derive: of a control, ``derive(reward, moments, seed)`` makes its reward of the trained
             one; None where that one is used as it is.
+        along_time: whether its reward depends on an episode's earlier steps.
         rank: its place in tables; those of equal rank are sorted by name.
     """
 
@@ -56,6 +57,7 @@ class Method:
     build: Callable[..., TensorDictModuleBase] | None = None
     loss: Callable[[Any, Any], LossModule] | None = None
     derive: Callable[[TensorDictModuleBase, Moments, int], TensorDictModuleBase] | None = None
+    along_time: bool = False
     rank: int = 100
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable
 from typing import Any, Protocol, cast
 
@@ -10,12 +9,13 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
-from giril_rl.config.schema import RunConfig, ScalingConfig
-from giril_rl.demos import Demonstration
+from giril_rl.config.schema import DemoRunConfig, RunConfig, ScalingConfig
+from giril_rl.demos import Demonstration, subsample
 from giril_rl.envs import BatchedEnv
 from giril_rl.errors import UserError
 from giril_rl.policies.agent import Agent
 from giril_rl.policies.making import make_agent, make_sac_agent
+from giril_rl.rewards.trajectory import fresh_episodes, trajectory_rewards
 from giril_rl.runs.randomness import Use
 from giril_rl.runs.run import Run
 from giril_rl.training.ppo import PPO
@@ -124,6 +124,7 @@ def make_algorithm(
         folder=run.folder / REPLAY,
         demonstration=known,
         relabel=transform if moving else None,
+        relabel_episodes=_of_whole_episodes(transform),
         scaling=_scaling(scaling, cfg.sac.gamma) if isinstance(scaling, ScalingConfig) else None,
         termination=termination,
         absorbing=absorbing,
@@ -134,7 +135,8 @@ def check_replay(cfg: RunConfig, demo: Demonstration) -> None:
     """Refuses a demonstration that cannot be put into SAC's replay buffer, where it is to be.
 
     Raises:
-        UserError: if it has no actions, or more transitions than ``sac.buffer_size``.
+        UserError: if it has no actions, or more transitions than ``sac.buffer_size``, once 1 in
+            ``demo.subsample`` was kept.
     """
     if cfg.algorithm != "sac" or cfg.sac.demonstration == "none":
         return
@@ -143,9 +145,10 @@ def check_replay(cfg: RunConfig, demo: Demonstration) -> None:
             f"the demonstration has no actions, which sac.demonstration={cfg.sac.demonstration} "
             "puts into the replay: set sac.demonstration=none."
         )
-    if len(demo) > cfg.sac.buffer_size:
+    pairs = -(-len(demo) // _every(cfg))
+    if pairs > cfg.sac.buffer_size:
         raise UserError(
-            f"sac.buffer_size={cfg.sac.buffer_size} is less than the demonstration's {len(demo):,} "
+            f"sac.buffer_size={cfg.sac.buffer_size} is less than the demonstration's {pairs:,} "
             "transitions: give the buffer more room, or set sac.demonstration=none."
         )
 
@@ -156,6 +159,19 @@ def _scaling(cfg: ScalingConfig, gamma: float) -> ReturnScaling | None:
     return ReturnScaling(gamma, reset=cast(ResetRule, cfg.reset), clip=cfg.clip)
 
 
+def _of_whole_episodes(transform: nn.Module | None) -> Callable[..., TensorDictBase] | None:
+    """What relabels whole episodes, where a reward is known at an episode's end only."""
+    parts = [] if transform is None else trajectory_rewards(transform)
+    if transform is None or not any(part.whole_episodes for part in parts):
+        return None
+
+    def relabel(episode: TensorDictBase) -> TensorDictBase:
+        with fresh_episodes(transform, learn=True):
+            return transform(episode)
+
+    return relabel
+
+
 def _demonstrated(
     demo: Demonstration,
     cfg: RunConfig,
@@ -163,13 +179,20 @@ def _demonstrated(
     moving: bool,
     reward: float | None,
 ) -> TensorDictBase:
-    """The demonstration's transitions, flat, with the reward to learn from."""
+    """The demonstration's transitions, 1 in ``demo.subsample``, with the reward to learn from.
+
+    The reward is that of the whole episodes, of which transitions are left out afterwards.
+    """
     check_replay(cfg, demo)
-    known = demo.transitions.unsqueeze(0).to(cfg.device)
+    known = demo.transitions.clone(False)
     if reward is not None:
-        shape = known.get(("next", "done")).shape
-        known = known.set(("next", "reward"), torch.full(shape, reward, device=known.device))
+        known.set(("next", "reward"), torch.full((len(demo), 1), reward))
     elif transform is not None and not moving:
-        # A copy, for rewards of trajectories remember where they are.
-        known = copy.deepcopy(transform).to(cfg.device)(known)
-    return known.squeeze(0)
+        with fresh_episodes(transform):
+            known = transform(known.unsqueeze(0).to(cfg.device)).squeeze(0)
+    return subsample(Demonstration(known.cpu()), _every(cfg))
+
+
+def _every(cfg: RunConfig) -> int:
+    """1 in how many demonstrated transitions is kept."""
+    return cfg.demo.subsample if isinstance(cfg, DemoRunConfig) else 1

@@ -177,6 +177,9 @@ def test_a_replay_buffer_holds_the_demonstration_before_anything_is_trained(give
         check_inputs(cfg)
     cfg.demo.first = len(whole) - 1  # What is not used needs no room.
     check_inputs(cfg)
+    cfg.demo.first, cfg.demo.subsample = None, 2
+    check_inputs(cfg)
+    cfg.demo.subsample = 1
     cfg.demo.first, cfg.sac.demonstration = None, "none"
     check_inputs(cfg)
 
