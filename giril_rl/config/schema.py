@@ -311,6 +311,10 @@ class BCConfig:
                 f"steps={run.steps}: cloning takes no environment steps; leave steps=0, "
                 f"{prefix}steps is the number of gradient steps."
             )
+        if run.algorithm != "ppo":
+            raise UserError(
+                f"algorithm={run.algorithm}: cloning is no reinforcement learning; leave it out."
+            )
         if self.stop == "held_out" and run.demo.subsample == 1:
             raise UserError(
                 f"{prefix}stop=held_out needs transitions to hold out and demo.subsample=1 leaves "
