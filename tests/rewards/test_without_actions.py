@@ -25,14 +25,6 @@ from giril_rl.rewards import (
     fit,
 )
 
-STATES_ALONE = [
-    name
-    for name, method in methods().items()
-    if method.kind == "method"
-    and method.build is not None
-    and not method.along_time  # Those have tests of their own.
-    and "use_actions" in [field.name for field in fields(method.settings)]
-]
 STATES_ALONE = ["giril", "cdil", "gail", "vail", "red"]
 NETWORKS = {"normalise": "pixels"}
 
