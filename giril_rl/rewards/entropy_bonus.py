@@ -21,6 +21,7 @@ from giril_rl.config.schema import knob
 from giril_rl.errors import UserError
 from giril_rl.networks.pixels import PixelFeatures
 from giril_rl.rewards.method import GREY, Method, register
+from giril_rl.rewards.points import DISTANCES_AT_ONCE, EXACT
 from giril_rl.rewards.scaler import ObservationScaler, PixelScaler, ScalingRule
 from giril_rl.rewards.transitions import (
     PIXELS_AT_ONCE,
@@ -32,8 +33,6 @@ from giril_rl.runs.pretrained import Pretrained, remembered
 from giril_rl.runs.randomness import seeded
 
 NEXT_STATE_KEYS: tuple[NestedKey, ...] = (("next", "observation"),)
-DISTANCES_AT_ONCE = 4_000_000
-"""Distances held in memory at a time, 16 MB of them."""
 
 
 @dataclass
@@ -84,9 +83,8 @@ def knn_bonus(states: Tensor, k: int) -> Tensor:
     bonuses = []
     for rows in torch.arange(n, device=states.device).split(max(1, DISTANCES_AT_ONCE // n)):
         # The exact mode: the one by matrix products gives neighbours a distance that is noise.
-        distance = torch.cdist(
-            states[rows], states, compute_mode="donot_use_mm_for_euclid_dist"
-        ).scatter(1, rows.unsqueeze(1), float("inf"))
+        distance = torch.cdist(states[rows], states, compute_mode=EXACT)
+        distance = distance.scatter(1, rows.unsqueeze(1), float("inf"))
         bonuses.append(distance.topk(k, largest=False, sorted=False).values.mean(1).log1p())
     return torch.cat(bonuses)
 

@@ -16,6 +16,7 @@ from giril_rl.methods import methods
 from giril_rl.networks.normalise import RunningNormaliser
 from giril_rl.rewards import NoiseReward, ObservationScaler
 from giril_rl.rewards.method import Method, Scope
+from giril_rl.runs.randomness import seeded
 
 DIM = 3
 FRAMES = (4, 84, 84)
@@ -148,12 +149,19 @@ def of_method(method: Method, kind: str, setting: Setting) -> TensorDictModuleBa
             else Unbounded((DIM,))
         },
     )
-    seen = torch.zeros(2, *FRAMES, dtype=torch.uint8) if kind == "pixels" else demonstration(0)
-    pairs = TensorDict({"observation": seen}, [len(seen)])
+    pairs = demonstrated(kind, setting)
     reward = method.build(settings_of(method, kind), env, pairs, seed=setting.seed)
     if method.derive is not None:
         reward = method.derive(reward, lambda: (2.0, 0.5), setting.seed)
     return reward
+
+
+def demonstrated(kind: str, setting: Setting) -> TensorDict:
+    """Transitions of a demonstration; observations are those of :func:`demonstration`, seed 0."""
+    seen = torch.zeros(2, *FRAMES, dtype=torch.uint8) if kind == "pixels" else demonstration(0)
+    with seeded(setting.seed):
+        entries = {"observation": seen, "action": setting.spec.rand((len(seen),))}
+        return TensorDict({**entries, "next": {"observation": seen.flip(0)}}, [len(seen)])
 
 
 def build(case: Case, *, seed: int = 0, keys: dict = PLAIN, fit: bool = True):
