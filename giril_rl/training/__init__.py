@@ -15,6 +15,7 @@ from giril_rl.training.demonstrations import check_inputs, obtain_demonstration,
 from giril_rl.training.experts import check_task, train_expert
 from giril_rl.training.fitting import fit_reward
 from giril_rl.training.loop import Trained, train_policy
+from giril_rl.training.own_visits import VisitTrainer
 from giril_rl.training.ppo import PPO, return_scaling
 from giril_rl.training.result import finish_run
 from giril_rl.training.reward_trainers import AdversarialTrainer, RewardTrainer
@@ -30,6 +31,7 @@ __all__ = [
     "Run",
     "Scores",
     "Trained",
+    "VisitTrainer",
     "check_discrete",
     "check_inputs",
     "check_task",
