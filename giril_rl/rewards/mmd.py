@@ -218,26 +218,21 @@ class MMDReward(PointReward):
         # In order of time, so that the most recent are the last, of all environments.
         flat = [_in_time(x, events[i]) for i, x in enumerate(entries)]
         raw = self.raw(*(x.to(self.visited.device) for x in flat))
-        before = int(self.seen)
+        before, size = int(self.seen), len(self.visited)
+        numbers = torch.arange(before, before + len(raw))
         if not before:
             between = median_distance(self.points(raw), self.points(self.atoms))
             self.bandwidths[1] = between.square()
         if self.kept == "recent":
-            numbers = torch.arange(before, before + len(raw))
             chosen = numbers % self.every == 0
-            places = numbers[chosen] // self.every % len(self.visited)
-            last = _last_of_each(places, len(self.visited))
-            self._store(raw[chosen.to(raw.device)], last)
-        else:
-            ends = torch.arange(before + 1, before + len(raw) + 1).double()
-            drawn = torch.rand(len(raw), generator=generator, dtype=torch.float64) * ends
-            self._store(raw, _last_of_each(drawn.long(), len(self.visited)))
-        self.seen += len(raw)
-
-    def _store(self, raw: Tensor, source: Tensor) -> None:
-        """Puts ``raw[source[i]]`` in place i, where that is not -1."""
-        places = (source >= 0).nonzero().squeeze(1)
-        self.visited[places.to(raw.device)] = raw[source[places].to(raw.device)]
+            raw, places = raw[chosen.to(raw.device)], numbers[chosen] // self.every % size
+        else:  # Algorithm R (Vitter 1985): the n-th gets a place with probability size/n.
+            drawn = torch.rand(len(raw), generator=generator, dtype=torch.float64) * (numbers + 1)
+            places = torch.where(numbers < size, numbers, drawn.long())
+        source = _last_of_each(places, size)
+        written = (source >= 0).nonzero().squeeze(1)
+        self.visited[written.to(raw.device)] = raw[source[written].to(raw.device)]
+        self.seen += len(numbers)
 
     @torch.no_grad()
     def squared_mmd(self) -> Tensor:
