@@ -15,10 +15,9 @@ from giril_rl.demos import subsample
 from giril_rl.envs import make_env
 from giril_rl.rewards import AdversarialConfig, DiscriminatorLoss, discriminator_reward
 from giril_rl.training import (
-    PPO,
     AdversarialTrainer,
     finish_run,
-    make_agent,
+    make_algorithm,
     obtain_demonstration,
     open_run,
     return_scaling,
@@ -41,7 +40,7 @@ def main(cfg: Config, out: Path) -> None:
             return
         demo, expert = obtain_demonstration(cfg)
         pairs = subsample(demo, cfg.demo.subsample)
-        env = run.closing(make_env(cfg.task, cfg.ppo.num_envs, cfg.seed))
+        env = run.closing(make_env(cfg.task, cfg.learner.num_envs, cfg.seed))
 
         seed = cfg.reward_seed
         reward = discriminator_reward(cfg.reward, env, pairs, seed=seed).to(cfg.device)
@@ -50,9 +49,10 @@ def main(cfg: Config, out: Path) -> None:
 
         transform = Compose(
             IntrinsicReward(reward),
-            *return_scaling(cfg.scaling, cfg.ppo.gamma),
+            *return_scaling(cfg),
         )
-        agent = make_agent(env, cfg.ppo, cfg.seed).to(cfg.device)
-        ppo = PPO(agent, cfg.ppo, steps=cfg.steps, termination=cfg.termination)
-        trained = train_policy(env, ppo, transform, seed=cfg.seed, run=run, reward_trainer=trainer)
-        finish_run(run, cfg, agent, trained, expert=expert, demo=demo, reward=reward)
+        learner = make_algorithm(env, cfg, run=run, demo=demo, transform=transform, moving=True)
+        trained = train_policy(
+            env, learner, transform, seed=cfg.seed, run=run, reward_trainer=trainer
+        )
+        finish_run(run, cfg, learner.agent, trained, expert=expert, demo=demo, reward=reward)

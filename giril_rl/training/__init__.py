@@ -3,7 +3,7 @@
 from giril_rl.moved import forwarding
 from giril_rl.policies import load_agent, make_agent
 from giril_rl.runs.run import Run
-from giril_rl.training.algorithm import Algorithm
+from giril_rl.training.algorithm import Algorithm, make_algorithm
 from giril_rl.training.baselines import (
     HeldAction,
     RandomPolicy,
@@ -19,10 +19,12 @@ from giril_rl.training.own_visits import VisitTrainer
 from giril_rl.training.ppo import PPO, return_scaling
 from giril_rl.training.result import finish_run
 from giril_rl.training.reward_trainers import AdversarialTrainer, RewardTrainer
+from giril_rl.training.sac import SAC
 from giril_rl.training.scoring import Scores, evaluate, evaluate_both
 
 __all__ = [
     "PPO",
+    "SAC",
     "AdversarialTrainer",
     "Algorithm",
     "HeldAction",
@@ -43,6 +45,7 @@ __all__ = [
     "held_action_scores",
     "load_agent",
     "make_agent",
+    "make_algorithm",
     "obtain_demonstration",
     "open_run",
     "return_scaling",
