@@ -76,9 +76,9 @@ def kernel(points: Tensor, others: Tensor, bandwidths: Tensor) -> Tensor:
     # By matrix products, about a centre near which they lose little.
     centre = others.mean(0) if len(others) else 0.0
     x, y = points - centre, others - centre
-    squared = x.square().sum(1, keepdim=True) + y.square().sum(1) - 2 * x @ y.T
-    squared = squared.clamp(min=0)
-    return sum(((-squared / b).exp() for b in bandwidths), torch.zeros_like(squared))
+    lengths = x.square().sum(1, keepdim=True) + y.square().sum(1)
+    opposite = torch.addmm(lengths, x, y.T, beta=-1, alpha=2).clamp_(max=0)  # -||x - y||^2
+    return sum(((opposite / b).exp_() for b in bandwidths), torch.zeros_like(opposite))
 
 
 def mean_kernel(

@@ -34,8 +34,8 @@ ROLES = ("observation", "action", "next observation")
 USE_ACTIONS = "read actions; false reads states alone, as a demonstration without actions needs"
 USE_NEXT = "read the next state as well"
 CLAMP = "bound on each scaled observation; null has none"
-DISTANCES_AT_ONCE = 4_000_000
-"""Distances held in memory at a time, 16 MB of them."""
+DISTANCES_AT_ONCE = 1_000_000
+"""Distances held in memory at a time, 4 MB of them."""
 EXACT = "donot_use_mm_for_euclid_dist"
 """A mode of torch.cdist: with matrix products, equal points would not be at distance 0."""
 MOST_PAIRED = 1_000

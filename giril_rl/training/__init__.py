@@ -11,6 +11,7 @@ from giril_rl.training.baselines import (
     held_action_scores,
 )
 from giril_rl.training.cloning import clone_behaviour
+from giril_rl.training.cloning_beside import CloningTrainer
 from giril_rl.training.demonstrations import check_inputs, obtain_demonstration, open_run
 from giril_rl.training.experts import check_task, train_expert
 from giril_rl.training.fitting import fit_reward
@@ -27,6 +28,7 @@ __all__ = [
     "SAC",
     "AdversarialTrainer",
     "Algorithm",
+    "CloningTrainer",
     "HeldAction",
     "RandomPolicy",
     "RewardTrainer",

@@ -15,6 +15,7 @@ from torchrl.data import Bounded, Categorical, TensorSpec, Unbounded
 from giril_rl.methods import methods
 from giril_rl.networks.normalise import RunningNormaliser
 from giril_rl.rewards import NoiseReward, ObservationScaler
+from giril_rl.rewards.dril import DisagreementConfig
 from giril_rl.rewards.method import Method, Scope
 from giril_rl.runs.randomness import seeded
 
@@ -136,6 +137,8 @@ def settings_of(method: Method, kind: str) -> Any:
         return None
     settings = method.settings()
     changes: dict[str, Any] = {"normalise": "pixels"} if kind == "pixels" else {"hidden": [16, 16]}
+    if isinstance(settings, DisagreementConfig):
+        changes["form"] = "variance"  # A sign hides what it depends on.
     return replace(settings, **{k: v for k, v in changes.items() if hasattr(settings, k)})
 
 
