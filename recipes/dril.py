@@ -1,7 +1,7 @@
 """DRIL: a reward for acting where cloned policies agree, and a policy cloned beside.
 
-Demonstration -> ensemble of cloned policies -> +1 where they agree, -1 elsewhere -> SAC or PPO, with
-gradient steps of behaviour cloning -> true score.
+Demonstration -> ensemble of cloned policies -> +1 where they agree, -1 elsewhere -> SAC or PPO with
+behaviour cloning -> true score.
 """
 
 from __future__ import annotations
@@ -9,12 +9,13 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import torch
 from torchrl.envs import Compose
 
 from giril_rl.config.schema import FitConfig, RewardRunConfig
 from giril_rl.demos import holdout, subsample
 from giril_rl.envs import make_env
-from giril_rl.rewards.disagreement import bootstrapped
+from giril_rl.rewards.disagreement import BOOTSTRAP, bootstrapped
 from giril_rl.rewards.dril import DisagreementConfig, DisagreementLoss, dril_reward
 from giril_rl.training import (
     CloningTrainer,
@@ -48,11 +49,11 @@ def main(cfg: Config, out: Path) -> None:
 
         seed, settings = cfg.reward_seed, cfg.reward
         reward = dril_reward(settings, env, pairs, seed=seed).to(cfg.device)
-        samples, unseen = (
-            bootstrapped(x, settings.members, seed=seed) for x in (pairs, validation)
-        )
+        samples = bootstrapped(pairs, settings.members, seed=seed)
+        # Every member is held to all of what no member has seen.
+        validation[BOOTSTRAP] = torch.ones(len(validation), settings.members)
         loss = DisagreementLoss(reward, bootstrap=True)
-        fit_reward(loss, samples, cfg.fit, seed=seed, run=run, validation=unseen)
+        fit_reward(loss, samples, cfg.fit, seed=seed, run=run, validation=validation)
         reward.calibrate(pairs, settings.quantile)
 
         transform = Compose(

@@ -97,7 +97,7 @@ def bootstrapped(pairs: TensorDictBase, members: int, *, seed: int) -> TensorDic
     """
     n = len(pairs)
     generator = torch.Generator().manual_seed(stream_seed("reward", seed))
-    drawn = torch.randint(n, (members, n), generator=generator)
+    drawn = torch.randint(max(n, 1), (members, n), generator=generator)
     counts = torch.zeros(members, n).scatter_add(1, drawn, torch.ones(members, n))
     return pairs.clone(False).set(BOOTSTRAP, counts.T.contiguous().to(pairs.device))
 

@@ -269,8 +269,9 @@ class DisagreementLoss(TransitionLoss):
 
     Args:
         reward: the module to train.
-        bootstrap: weigh each member's losses by the batch's :func:`~giril_rl.rewards.disagreement.bootstrapped` counts, so that each
-            learns from a sample of its own; False leaves different initial weights only.
+        bootstrap: weigh each member's losses by how often its sample has a transition, see
+            :func:`~giril_rl.rewards.disagreement.bootstrapped`; False leaves different initial
+            weights only.
         reduction: ``"mean"``, ``"sum"`` or ``"none"`` over transitions.
         functional: see :class:`~giril_rl.rewards.TransitionLoss`.
 

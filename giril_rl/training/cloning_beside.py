@@ -14,7 +14,10 @@ from giril_rl.runs.randomness import stream_seed
 class Imitator(Protocol):
     """An agent that can be cloned beside its algorithm's own learning."""
 
-    actor: nn.Module
+    @property
+    def actor(self) -> nn.Module:
+        """What is trained."""
+        ...
 
     def imitation_loss(self, observation: Tensor, action: Tensor) -> Tensor:
         """The loss of each demonstrated pair, ``(*batch,)``, differentiable in the actor."""
