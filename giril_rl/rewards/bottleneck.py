@@ -84,6 +84,7 @@ class BottleneckReward(DiscriminatorReward):
         form: RewardForm = "positive",
         normalise: DiscriminatorScaling = "standardise",
         clamp: float | None = 10.0,
+        use_actions: bool = True,
         seed: int = 0,
         in_keys: Sequence[NestedKey] = PAIR_KEYS,
         out_keys: Sequence[NestedKey] = REWARD_KEYS,
@@ -94,7 +95,7 @@ class BottleneckReward(DiscriminatorReward):
         Arguments are those of :meth:`DiscriminatorReward.for_vectors`, and ``latent``, the size
         of z.
         """
-        actions = ActionEncoder(action_spec)
+        actions = ActionEncoder(action_spec, use_actions=use_actions)
         with seeded(seed):
             encoder = mlp(observation_dim + actions.size, 2 * latent, hidden)
             head = nn.Linear(latent, 1)
@@ -116,13 +117,14 @@ class BottleneckReward(DiscriminatorReward):
         *,
         channels: int = 4,
         form: RewardForm = "positive",
+        use_actions: bool = True,
         seed: int = 0,
         in_keys: Sequence[NestedKey] = PAIR_KEYS,
         out_keys: Sequence[NestedKey] = REWARD_KEYS,
         latent: int = 8,
     ) -> BottleneckReward:
         """The paper's encoder for ``channels`` frames of 84x84; see `for_vectors`."""
-        actions = ActionEncoder(action_spec)
+        actions = ActionEncoder(action_spec, use_actions=use_actions)
         with seeded(seed):
             encoder = PixelBottleneck(actions.size, latent, channels)
             head = nn.Linear(latent, 1)
@@ -245,7 +247,7 @@ def bottleneck_reward(
     """VAIL's reward; arguments as :func:`~giril_rl.rewards.discriminator_reward` has them."""
     own = "hidden normalise clamp"
     reward = reward_for(
-        env, BottleneckReward, settings, seed=seed, of_all="form latent", of_vectors=own
+        env, BottleneckReward, settings, seed=seed, of_all="form latent use_actions", of_vectors=own
     )
     reward.fit_scaler(pairs.get("observation"))
     return reward

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from torchrl.data import TensorSpec
 from torchrl.envs import EnvBase
 
-from giril_rl.config.schema import COMPILE, knob
+from giril_rl.config.schema import COMPILE, USE_ACTIONS, knob
 from giril_rl.errors import UserError
 from giril_rl.networks.normalise import RunningNormaliser, running_statistics
 from giril_rl.networks.pixels import PixelDiscriminator
@@ -43,6 +43,7 @@ from giril_rl.rewards.transitions import (
     check_output,
     read,
     reward_for,
+    with_action,
 )
 from giril_rl.runs.pretrained import Pretrained, remembered
 from giril_rl.runs.randomness import seeded
@@ -72,6 +73,7 @@ class AdversarialConfig:
         10.0, "bound on normalised observations; null has none", low=0, low_open=True
     )
     hidden: list[int] = knob([100, 100], "hidden layers of the discriminator (tanh)", low=1)
+    use_actions: bool = knob(True, USE_ACTIONS)
     seed: int | None = knob(None, "seed of the discriminator; null takes the run's seed", low=0)
     compile: bool = knob(False, COMPILE)
 
@@ -118,10 +120,10 @@ class DiscriminatorReward(Pretrained, TransitionReward):
         out_keys: Sequence[NestedKey] = REWARD_KEYS,
     ) -> None:
         adversarial_reward(torch.zeros(1), form)  # Refuses an unknown form before it is needed.
-        super().__init__("a discriminator's reward", ("observation", "action"), in_keys, out_keys)
+        roles = "observation", "action"
+        super().__init__("a discriminator's reward", roles, in_keys, out_keys, actions=actions)
         self.network = network
         self.scaler = scaler
-        self.actions = actions
         self.form: RewardForm = form
 
     @classmethod
@@ -135,6 +137,7 @@ class DiscriminatorReward(Pretrained, TransitionReward):
         form: RewardForm = "positive",
         normalise: DiscriminatorScaling = "standardise",
         clamp: float | None = 10.0,
+        use_actions: bool = True,
         seed: int = 0,
         in_keys: Sequence[NestedKey] = PAIR_KEYS,
         out_keys: Sequence[NestedKey] = REWARD_KEYS,
@@ -148,6 +151,7 @@ class DiscriminatorReward(Pretrained, TransitionReward):
             form: the reward's form.
             normalise: the observation's rule, see :func:`discriminator_scaler`.
             clamp: bound on each scaled observation; None has none.
+            use_actions: False reads observations alone, see :class:`ActionEncoder`.
             seed: seed of the weights. The global random state stays as it is.
             in_keys: see the class.
             out_keys: see the class.
@@ -155,7 +159,7 @@ class DiscriminatorReward(Pretrained, TransitionReward):
         Raises:
             UserError: for an unknown form, rule or kind of action.
         """
-        actions = ActionEncoder(action_spec)
+        actions = ActionEncoder(action_spec, use_actions=use_actions)
         with seeded(seed):
             network = mlp(observation_dim + actions.size, 1, hidden)
         return cls(
@@ -175,12 +179,13 @@ class DiscriminatorReward(Pretrained, TransitionReward):
         *,
         channels: int = 4,
         form: RewardForm = "positive",
+        use_actions: bool = True,
         seed: int = 0,
         in_keys: Sequence[NestedKey] = PAIR_KEYS,
         out_keys: Sequence[NestedKey] = REWARD_KEYS,
     ) -> DiscriminatorReward:
         """The paper's network for ``channels`` frames of 84x84; see `for_vectors`."""
-        actions = ActionEncoder(action_spec)
+        actions = ActionEncoder(action_spec, use_actions=use_actions)
         with seeded(seed):
             network = PixelDiscriminator(actions.size, channels=channels)
         return cls(
@@ -313,20 +318,19 @@ class DiscriminatorLoss(RewardLoss):
             raise UserError(f"penalty={penalty} is negative: give a weight of 0 or more.")
         super().__init__(reward, functional=functional)
         self.penalty = penalty
-        observation, action = (k if isinstance(k, tuple) else (k,) for k in reward.in_keys)
-        self.set_keys(
-            expert_observation=("expert", *observation),
-            expert_action=("expert", *action),
-            policy_observation=("policy", *observation),
-            policy_action=("policy", *action),
-        )
+        entries = dict(zip(("observation", "action"), reward.in_keys, strict=False))
+        keys = {
+            f"{side}_{entry}": (side, *(key if isinstance(key, tuple) else (key,)))
+            for side in ("expert", "policy")
+            for entry, key in entries.items()
+        }
+        self._entries = list(keys)
+        self.set_keys(**keys)
 
     @property
     def in_keys(self) -> list[NestedKey]:
         """Keys of the expert's observation and action and of the policy's."""
-        keys = self.tensor_keys
-        expert = [keys.expert_observation, keys.expert_action]
-        return [*expert, keys.policy_observation, keys.policy_action]
+        return [getattr(self.tensor_keys, entry) for entry in self._entries]
 
     @property
     def out_keys(self) -> list[NestedKey]:
@@ -354,8 +358,11 @@ class DiscriminatorLoss(RewardLoss):
 
     def _terms(self, tensordict: TensorDictBase) -> TensorDictBase:
         entries = read(tensordict, self.in_keys)
-        expert = _flat("expert", *self.reward.inputs(*entries[:2]))
-        policy = _flat("policy", *self.reward.inputs(*entries[2:]))
+        half = len(entries) // 2
+        expert, policy = (
+            _flat(name, *self.reward.inputs(*with_action(self.reward, pairs)))
+            for name, pairs in (("expert", entries[:half]), ("policy", entries[half:]))
+        )
         # One pass for both sets.
         observation, encoding = (torch.cat(sets) for sets in zip(expert, policy, strict=True))
         logit, out = self._judge(observation, encoding, len(expert[0]))
@@ -383,7 +390,7 @@ def _flat(name: str, observation: Tensor, encoding: Tensor) -> tuple[Tensor, Ten
     dims = encoding.ndim - 1
     if dims != 1:
         observation = observation.reshape(-1, *observation.shape[dims:])
-        encoding = encoding.reshape(-1, encoding.shape[-1])
+        encoding = encoding.reshape(encoding.shape[:-1].numel(), encoding.shape[-1])
     if not len(encoding):
         raise UserError(f"the {name}'s set has no pairs: give at least one.")
     return observation, encoding
@@ -402,7 +409,7 @@ def discriminator_reward(
     """
     own = "hidden normalise clamp"
     reward = reward_for(
-        env, DiscriminatorReward, settings, seed=seed, of_all="form", of_vectors=own
+        env, DiscriminatorReward, settings, seed=seed, of_all="form use_actions", of_vectors=own
     )
     reward.fit_scaler(pairs.get("observation"))
     return reward

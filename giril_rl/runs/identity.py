@@ -49,6 +49,8 @@ ADDED = {
     "demo.lives": "first",
     "clip_reward": False,
     "held_episodes": 20,
+    "demo.first": None,
+    **dict.fromkeys(("reward.use_actions", "giril.use_actions", "icm.use_actions"), True),
 }
 """Keys that earlier versions did not have, with the value that they behaved by."""
 RETIRED = {"profile": "released", "batch_mean": True}
