@@ -15,12 +15,11 @@ from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from giril_rl.config.schema import knob
+from giril_rl.config.schema import USE_ACTIONS, knob
 from giril_rl.errors import UserError
 from giril_rl.rewards.method import GREY, Method, register
 from giril_rl.rewards.points import (
     CLAMP,
-    USE_ACTIONS,
     USE_NEXT,
     PointReward,
     in_parts,

@@ -31,7 +31,6 @@ from giril_rl.runs.pretrained import Pretrained, remembered
 from giril_rl.runs.randomness import seeded, stream_seed
 
 ROLES = ("observation", "action", "next observation")
-USE_ACTIONS = "read actions; false reads states alone, as a demonstration without actions needs"
 USE_NEXT = "read the next state as well"
 CLAMP = "bound on each scaled observation; null has none"
 DISTANCES_AT_ONCE = 1_000_000

@@ -163,8 +163,12 @@ def demonstrated(kind: str, setting: Setting) -> TensorDict:
     """Transitions of a demonstration; observations are those of :func:`demonstration`, seed 0."""
     seen = torch.zeros(2, *FRAMES, dtype=torch.uint8) if kind == "pixels" else demonstration(0)
     with seeded(setting.seed):
-        entries = {"observation": seen, "action": setting.spec.rand((len(seen),))}
-        return TensorDict({**entries, "next": {"observation": seen.flip(0)}}, [len(seen)])
+        action = setting.spec.rand((len(seen),))
+    values = {"observation": seen, "action": action, "next_observation": seen.flip(0)}
+    out = TensorDict(batch_size=[len(seen)])
+    for name, value in values.items():
+        out.set(setting.keys[name], value)
+    return out
 
 
 def build(case: Case, *, seed: int = 0, keys: dict = PLAIN, fit: bool = True):
