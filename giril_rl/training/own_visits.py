@@ -10,6 +10,9 @@ from tensordict import TensorDictBase
 from giril_rl.rewards.mmd import MMDReward
 from giril_rl.runs.randomness import stream_seed
 
+MEASURED_EVERY = 1_000
+"""Environment steps between two measurements of the MMD, which cost as much as a minibatch."""
+
 
 class VisitTrainer:
     """Keeps GMMIL's reward up to date with what the policy visits; nothing is trained.
@@ -41,9 +44,13 @@ class VisitTrainer:
         """Tells the reward of a batch ``(num_envs, time)``.
 
         Returns:
-            The squared MMD between demonstration and visits, and how many are kept.
+            The squared MMD between demonstration and visits, and how many are kept; at the first
+            batch and then about every 1,000 environment steps, otherwise nothing.
         """
+        before = int(self.reward.seen)
         self.reward.observe(batch, self._generator)
+        if before and before // MEASURED_EVERY == int(self.reward.seen) // MEASURED_EVERY:
+            return {}
         return {
             "mmd/squared": self.reward.squared_mmd().item(),
             "mmd/visits": float((self.reward.weights > 0).sum()),

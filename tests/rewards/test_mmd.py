@@ -9,7 +9,7 @@ from giril_rl.errors import UserError
 from giril_rl.rewards import points as points_module
 from giril_rl.rewards.mmd import MMDReward, kernel, mean_kernel, squared_mmd
 from giril_rl.runs.checkpoint import load_state, save_state
-from giril_rl.training import VisitTrainer
+from giril_rl.training import VisitTrainer, own_visits
 
 BOX = Bounded(-1.0, 1.0, shape=(1,))
 
@@ -186,7 +186,9 @@ def test_policy_that_matches_the_demonstration_earns_nothing():
 
 
 @pytest.mark.parametrize("kept", ["recent", "all"])
-def test_a_trainer_resumes_bit_for_bit(kept, tmp_path):
+def test_a_trainer_resumes_bit_for_bit(kept, tmp_path, monkeypatch):
+    monkeypatch.setattr(own_visits, "MEASURED_EVERY", 16)
+
     def trainer():
         return VisitTrainer(made(kept=kept, visits=10, every=2), seed=3)
 
@@ -206,6 +208,12 @@ def test_a_trainer_resumes_bit_for_bit(kept, tmp_path):
     assert torch.equal(resumed.reward.visited, whole.reward.visited)
     batch = transitions(5, seed=9)
     assert torch.equal(paid(resumed.reward, batch), paid(whole.reward, batch))
+
+
+def test_the_mmd_is_measured_now_and_then():
+    trainer = VisitTrainer(made(every=1), seed=0)
+    measured = [bool(trainer.update(transitions(2, 100, seed=i))) for i in range(11)]
+    assert measured == [i in (0, 4, 9) for i in range(11)]
 
 
 def test_memory_stays_bounded():
