@@ -97,8 +97,9 @@ class PointReward(Pretrained, TransitionReward):
       the demonstration. A discrete one is one-hot: two actions are as far from each other as two
       standardised numbers are on average, a squared distance of 2.
     - All is divided by the square root of the number of dimensions, of which a discrete action is
-      one. So a distance is a root mean square over dimensions, near 1 within any demonstration, and
-      comparable between tasks. With ``normalise="raw"`` nothing is divided.
+      one. So a distance is a root mean square over dimensions, comparable between tasks: two
+      independent draws from a demonstration are the square root of 2 apart, whatever the task. With
+      ``normalise="raw"`` nothing is divided.
 
     A subclass implements :meth:`of_points`. Nothing is trained: :meth:`remember` takes the
     demonstration, ``atoms`` transitions of it.
@@ -116,6 +117,20 @@ class PointReward(Pretrained, TransitionReward):
     Raises:
         UserError: for another number of keys, entries that are missing or of a wrong shape, or use
             before :meth:`remember`.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> from torchrl.data import Categorical
+        >>> class MeanDistance(PointReward):
+        ...     def __init__(self, **points):
+        ...         super().__init__("a mean distance", **points)
+        ...     def of_points(self, points, atoms):
+        ...         return -torch.cdist(points, atoms).mean(-1)
+        >>> reward = MeanDistance.for_vectors(1, Categorical(2), atoms=2, use_actions=False)
+        >>> reward.remember(TensorDict({"observation": torch.tensor([[0.0], [2.0]])}, [2]))
+        >>> batch = TensorDict({"observation": torch.tensor([[0.0], [4.0]])}, [2])
+        >>> reward(batch)["next", "intrinsic_reward"].tolist()
+        [[-1.0], [-3.0]]
     """
 
     atoms: Tensor
