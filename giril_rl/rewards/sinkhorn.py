@@ -308,6 +308,6 @@ register(
         trained="never",
         settings=SinkhornConfig,
         build=sinkhorn_reward,
-        along_time=True,
+        scope="trajectory",
     )
 )
