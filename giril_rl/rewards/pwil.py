@@ -294,6 +294,6 @@ register(
         trained="never",
         settings=PWILConfig,
         build=pwil_reward,
-        along_time=True,
+        scope="trajectory",
     )
 )

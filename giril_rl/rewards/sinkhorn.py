@@ -297,6 +297,6 @@ register(
         trained="never",
         settings=SinkhornConfig,
         build=sinkhorn_reward,
-        along_time=True,
+        scope="trajectory",
     )
 )
