@@ -20,6 +20,7 @@ from giril_rl.runs.randomness import stream_seed
 TRANSITION_KEYS: tuple[NestedKey, ...] = ("observation", "action", ("next", "observation"))
 PAIR_KEYS: tuple[NestedKey, ...] = ("observation", "action")
 STATE_KEYS: tuple[NestedKey, ...] = ("observation", ("next", "observation"))
+TERMINATED: NestedKey = ("next", "terminated")
 REWARD_KEYS: tuple[NestedKey, ...] = (("next", "intrinsic_reward"),)
 PIXELS_AT_ONCE = 256
 """Transitions of frames that a network takes at a time."""

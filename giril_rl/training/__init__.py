@@ -17,7 +17,7 @@ from giril_rl.training.fitting import fit_reward
 from giril_rl.training.loop import Trained, train_policy
 from giril_rl.training.ppo import PPO, return_scaling
 from giril_rl.training.result import finish_run
-from giril_rl.training.reward_trainers import AdversarialTrainer, RewardTrainer
+from giril_rl.training.reward_trainers import AdversarialTrainer, RewardTrainer, terminal_rate
 from giril_rl.training.scoring import Scores, evaluate, evaluate_both
 
 __all__ = [
@@ -44,6 +44,7 @@ __all__ = [
     "obtain_demonstration",
     "open_run",
     "return_scaling",
+    "terminal_rate",
     "train_expert",
     "train_policy",
 ]
