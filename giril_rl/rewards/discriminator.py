@@ -7,14 +7,15 @@ Labels, forms of the reward and the gradient penalty are pure functions in
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import torch
 import torch.nn.functional as F
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import dispatch
+from tensordict.nn import TensorDictModuleBase, dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.data import TensorSpec
@@ -335,7 +336,66 @@ def discriminator_scaler(
     )
 
 
-class DiscriminatorLoss(RewardLoss):
+class AdversarialLoss(RewardLoss):
+    """The loss of a discriminator between an expert's transitions and a policy's.
+
+    A subclass names what it reads in ``in_keys`` and ``transition_keys``, and computes in
+    ``_terms``. There is no ``reduction``: each term is a mean over its own set.
+
+    Args:
+        reward: the module to train; its parameters are this loss's parameters.
+        penalty: weight of the gradient penalty; 0 leaves it out.
+        functional: see :class:`~giril_rl.rewards.TransitionLoss`.
+
+    Raises:
+        UserError: for a negative penalty.
+    """
+
+    reward: Any
+
+    def __init__(
+        self, reward: TensorDictModuleBase, *, penalty: float = 0.0, functional: bool = False
+    ) -> None:
+        if not penalty >= 0:
+            raise UserError(f"penalty={penalty} is negative: give a weight of 0 or more.")
+        super().__init__(reward, functional=functional)
+        self.penalty = penalty
+
+    @property
+    @abstractmethod
+    def transition_keys(self) -> list[NestedKey]:
+        """What is read of a set of transitions, by its keys in a batch."""
+
+    @property
+    def out_keys(self) -> list[NestedKey]:
+        """Names of the terms to be added, ``loss_*``, and of what is logged."""
+        penalty = ["loss_penalty"] if self.penalty else []
+        return ["loss_expert", "loss_policy", *penalty, *self.log_keys]
+
+    @property
+    def log_keys(self) -> list[str]:
+        """Names of what is logged."""
+        return ["accuracy_expert", "accuracy_policy"]
+
+    def after_step(self, log: Mapping[str, Tensor]) -> None:
+        """Follows each gradient step; ``log`` has the step's :attr:`log_keys`."""
+
+    def logged_state(self) -> dict[str, float]:
+        """Numbers of the loss's own that are worth logging."""
+        return {}
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """The terms and what is logged, all scalars."""
+        with self.parameters_in_reward():
+            return self._terms(tensordict)
+
+    @abstractmethod
+    def _terms(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """All :attr:`out_keys`."""
+
+
+class DiscriminatorLoss(AdversarialLoss):
     """GAIL's binary cross-entropy on logits, with an optional gradient penalty.
 
     - ``loss_expert`` and ``loss_policy``: the two terms of
@@ -354,7 +414,6 @@ class DiscriminatorLoss(RewardLoss):
     The two sets are usually under ``"expert"`` and ``"policy"``, each of any leading shape. Their
     shapes may differ; the TensorDict that holds both then has no batch dimension. Without penalty
     and for equal sizes the loss is that of TorchRL's ``GAILLoss``, which expects probabilities.
-    There is no ``reduction``: each term is a mean over its own set.
 
     Args:
         reward: the module to train; its parameters are this loss's parameters.
@@ -395,10 +454,7 @@ class DiscriminatorLoss(RewardLoss):
     def __init__(
         self, reward: DiscriminatorReward, *, penalty: float = 0.0, functional: bool = False
     ) -> None:
-        if not penalty >= 0:
-            raise UserError(f"penalty={penalty} is negative: give a weight of 0 or more.")
-        super().__init__(reward, functional=functional)
-        self.penalty = penalty
+        super().__init__(reward, penalty=penalty, functional=functional)
         observation, action = (k if isinstance(k, tuple) else (k,) for k in reward.in_keys)
         self.set_keys(
             expert_observation=("expert", *observation),
@@ -421,30 +477,6 @@ class DiscriminatorLoss(RewardLoss):
         """What is read of a set of transitions, by its keys in a batch."""
         ends = [] if self.reward.absorbing is None else [TERMINATED]
         return [*self.reward.in_keys, *ends]
-
-    @property
-    def out_keys(self) -> list[NestedKey]:
-        """Names of the terms to be added, ``loss_*``, and of what is logged."""
-        penalty = ["loss_penalty"] if self.penalty else []
-        return ["loss_expert", "loss_policy", *penalty, *self.log_keys]
-
-    @property
-    def log_keys(self) -> list[str]:
-        """Names of what is logged."""
-        return ["accuracy_expert", "accuracy_policy"]
-
-    def after_step(self, log: Mapping[str, Tensor]) -> None:
-        """Follows each gradient step; ``log`` has the step's :attr:`log_keys`."""
-
-    def logged_state(self) -> dict[str, float]:
-        """Numbers of the loss's own that are worth logging."""
-        return {}
-
-    @dispatch
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """The terms and what is logged, all scalars."""
-        with self.parameters_in_reward():
-            return self._terms(tensordict)
 
     def _terms(self, tensordict: TensorDictBase) -> TensorDictBase:
         entries = read(tensordict, self.in_keys)

@@ -11,7 +11,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 
 from giril_rl.graphs.gradients import TracedGradients
-from giril_rl.rewards.discriminator import DiscriminatorConfig, DiscriminatorLoss
+from giril_rl.rewards.discriminator import AdversarialLoss, DiscriminatorConfig
 from giril_rl.rewards.transitions import TERMINATED
 from giril_rl.runs.randomness import restore_rng, rng_state, seeded, stream_seed
 
@@ -85,7 +85,7 @@ class AdversarialTrainer:
     Examples:
         >>> from tensordict import TensorDict
         >>> from torchrl.data import Bounded
-        >>> from giril_rl.rewards import AdversarialConfig, DiscriminatorReward
+        >>> from giril_rl.rewards import AdversarialConfig, DiscriminatorLoss, DiscriminatorReward
         >>> reward = DiscriminatorReward.for_vectors(
         ...     2, Bounded(-1, 1, shape=(1,)), normalise="raw"
         ... )
@@ -102,7 +102,7 @@ class AdversarialTrainer:
 
     def __init__(
         self,
-        loss: DiscriminatorLoss,
+        loss: AdversarialLoss,
         expert: TensorDictBase,
         cfg: DiscriminatorConfig,
         *,
