@@ -14,6 +14,7 @@ from giril_rl.config.schema import AveragedRunConfig, FitConfig, knob
 from giril_rl.demos import Demonstration, holdout, subsample
 from giril_rl.envs import BatchedEnv
 from giril_rl.rewards import CuriosityConfig, GenerativeConfig
+from giril_rl.rewards.entropy_bonus import EntropyBonusConfig
 from giril_rl.rewards.method import Method
 from giril_rl.runs.metrics import METRICS, read_metrics
 from giril_rl.runs.run import Run
@@ -45,6 +46,7 @@ class ControlRunConfig(AveragedRunConfig):
     held_episodes: int = knob(20, "held_action: episodes that choose the action", low=1)
     giril: GenerativeConfig = field(default_factory=GenerativeConfig)
     icm: CuriosityConfig = field(default_factory=CuriosityConfig)
+    bonus: EntropyBonusConfig = field(default_factory=EntropyBonusConfig)
     fit: FitConfig = field(default_factory=FitConfig)
 
     @property
@@ -111,7 +113,8 @@ def control_reward(
     """
     method: Method = cfg.method
     assert method.build is not None
-    settings = next((p for p in (cfg.giril, cfg.icm) if type(p) is method.settings), None)
+    parts = cfg.giril, cfg.icm, cfg.bonus
+    settings = next((part for part in parts if type(part) is method.settings), None)
     seed = cfg.seed if settings is None or settings.seed is None else settings.seed
     pairs = None if demo is None else subsample(demo, cfg.demo.subsample)
     reward = method.build(settings, env, pairs, seed=seed).to(cfg.device)

@@ -17,6 +17,7 @@ SKY, RED, GREY = "#56B4E9", "#D55E00", "#8C8C8C"
 which is hard to see on white."""
 Kind = Literal["method", "control"]
 Trained = Literal["before", "beside", "never"]
+Scope = Literal["transition", "batch", "trajectory"]
 Moments = Callable[[], tuple[float, float]]
 """Computes mean and variance of a reward over the demonstration."""
 
@@ -43,6 +44,9 @@ class Method:
             trained.
         derive: of a control, ``derive(reward, moments, seed)`` makes its reward of the trained
             one; None where that one is used as it is.
+        scope: what the reward of a transition depends on besides the reward's own state: the
+            "transition" alone, the whole "batch" that it is computed with, or the "trajectory" so
+            far.
         rank: its place in tables; those of equal rank are sorted by name.
     """
 
@@ -51,6 +55,7 @@ class Method:
     colour: str
     kind: Kind = "method"
     trained: Trained = "before"
+    scope: Scope = "transition"
     demonstration: bool = True
     settings: type | None = None
     build: Callable[..., TensorDictModuleBase] | None = None

@@ -67,7 +67,7 @@ class TransitionReward(TensorDictModuleBase):
     ) -> None:
         super().__init__()
         if len(in_keys) != len(roles) or len(out_keys) != 1:
-            number = {2: "two", 3: "three", 4: "four"}[len(roles)]
+            number = {1: "one", 2: "two", 3: "three", 4: "four"}[len(roles)]
             raise UserError(
                 f"{what} has {number} in_keys ({', '.join(roles)}) and one out_key, not "
                 f"{list(in_keys)} and {list(out_keys)}."

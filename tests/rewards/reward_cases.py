@@ -15,7 +15,7 @@ from torchrl.data import Bounded, Categorical, TensorSpec, Unbounded
 from giril_rl.methods import methods
 from giril_rl.networks.normalise import RunningNormaliser
 from giril_rl.rewards import NoiseReward, ObservationScaler
-from giril_rl.rewards.method import Method
+from giril_rl.rewards.method import Method, Scope
 
 DIM = 3
 FRAMES = (4, 84, 84)
@@ -76,6 +76,7 @@ class Case:
         deterministic: whether equal transitions get equal rewards. A noisy one has to draw from a
             generator of its own, and equal numbers of draws from equal states have to be equal.
         takes_keys: whether ``build`` heeds the setting's keys.
+        scope: what the value depends on, see :class:`giril_rl.rewards.method.Method`.
     """
 
     name: str
@@ -84,6 +85,7 @@ class Case:
     depends_on: tuple[str, ...] | None = None
     deterministic: bool = True
     takes_keys: bool = True
+    scope: Scope = "transition"
 
     @property
     def pixels(self) -> bool:
@@ -122,7 +124,7 @@ def registered_cases() -> list[Case]:
         for kind in kinds:
             build = functools.partial(of_method, method, kind)
             noisy = isinstance(build(Setting(Categorical(4), PLAIN, 0)), NoiseReward)
-            case = Case(f"{name}-{kind}", build, kind, None, not noisy, takes_keys=False)
+            case = Case(f"{name}-{kind}", build, kind, None, not noisy, False, method.scope)
             found.append(case)
     return found
 

@@ -85,6 +85,9 @@ WITH_KEYS = [case for case in CASES if case.takes_keys]
 TRAINED = [name for name, method in methods().items() if method.loss and method.build]
 
 every_reward = pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+of_transitions = pytest.mark.parametrize(
+    "case", [case for case in CASES if case.scope == "transition"], ids=lambda case: case.name
+)
 
 
 @every_reward
@@ -92,17 +95,17 @@ def test_one_value_per_transition(case):
     checks.check_one_value_per_transition(case)
 
 
-@every_reward
+@of_transitions
 def test_batch_shape_does_not_matter(case):
     checks.check_batch_shape_does_not_matter(case)
 
 
-@every_reward
+@of_transitions
 def test_environments_are_independent(case):
     checks.check_environments_are_independent(case)
 
 
-@every_reward
+@of_transitions
 def test_depends_on_what_it_says(case):
     checks.check_depends_on_what_it_says(case)
 
@@ -132,12 +135,12 @@ def test_nested_keys(case):
     checks.check_nested_keys(case)
 
 
-@every_reward
+@of_transitions
 def test_environment_and_batch_agree(case, step_counter):
     checks.check_environment_and_batch_agree(case, step_counter)
 
 
-@every_reward
+@of_transitions
 def test_terminal_step(case, step_counter):
     checks.check_terminal_step(case, step_counter)
 
