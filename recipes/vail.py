@@ -17,11 +17,13 @@ from giril_rl.rewards import BottleneckConfig, BottleneckLoss, bottleneck_reward
 from giril_rl.training import (
     PPO,
     AdversarialTrainer,
+    absorbing_value,
     finish_run,
     make_agent,
     obtain_demonstration,
     open_run,
     return_scaling,
+    terminal_rate,
     train_policy,
 )
 from giril_rl.transforms import IntrinsicReward
@@ -44,7 +46,8 @@ def main(cfg: Config, out: Path) -> None:
         env = run.closing(make_env(cfg.task, cfg.ppo.num_envs, cfg.seed))
 
         seed = cfg.reward_seed
-        reward = bottleneck_reward(cfg.reward, env, pairs, seed=seed).to(cfg.device)
+        settings = cfg.reward.settled(cfg)
+        reward = bottleneck_reward(settings, env, pairs, seed=seed).to(cfg.device)
         loss = BottleneckLoss(
             reward,
             information=cfg.reward.information,
@@ -52,10 +55,12 @@ def main(cfg: Config, out: Path) -> None:
             beta=cfg.reward.beta_start,
             penalty=cfg.reward.penalty,
         )
-        trainer = AdversarialTrainer(loss, pairs, cfg.reward, seed=seed)
+        rate = terminal_rate(demo.transitions)
+        trainer = AdversarialTrainer(loss, pairs, settings, seed=seed, terminal_rate=rate)
 
         transform = Compose(
             IntrinsicReward(reward),
+            *absorbing_value(reward, cfg.ppo.gamma),
             *return_scaling(cfg.scaling, cfg.ppo.gamma),
         )
         agent = make_agent(env, cfg.ppo, cfg.seed).to(cfg.device)

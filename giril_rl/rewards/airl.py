@@ -65,18 +65,22 @@ class AIRLConfig(DiscriminatorConfig):
         None, "discount of the shaping; null takes the learner's", low=0, high=1
     )
 
-    def settled(self, *, gamma: float, off_policy: bool) -> AIRLConfig:
-        """These settings with the learner's discount and form where they are null.
+    def settled(self, run: object) -> AIRLConfig:
+        """These settings with the learner's form and discount, where they are null.
+
+        Args:
+            run: the run's settings, of which the learner and its discount are read.
 
         Examples:
-            >>> AIRLConfig().settled(gamma=0.9, off_policy=True).form
-            'f'
+            >>> from giril_rl.config.schema import RewardRunConfig
+            >>> settled = AIRLConfig().settled(RewardRunConfig())
+            >>> settled.form, settled.gamma
+            ('log_ratio', 0.99)
         """
-        return replace(
-            self,
-            form=self.form or ("f" if off_policy else "log_ratio"),
-            gamma=gamma if self.gamma is None else self.gamma,
-        )
+        learner = getattr(run, "algorithm", "ppo")
+        form = self.form or ("log_ratio" if learner == "ppo" else "f")
+        gamma = getattr(run, learner).gamma if self.gamma is None else self.gamma
+        return replace(self, form=form, gamma=gamma)
 
 
 def shaped(g: Tensor, h: Tensor, h_next: Tensor, terminated: Tensor, gamma: float) -> Tensor:
@@ -392,12 +396,13 @@ def airl_reward(
     """AIRL's reward, untrained, its scaler fitted to ``pairs`` unless it follows the policy.
 
     Args:
-        settings: its settings, :meth:`AIRLConfig.settled` for a learner.
+        settings: its settings, :meth:`AIRLConfig.settled` for a learner; null is f, of 0.99.
         env: the environment, for its specs.
         pairs: the demonstrated transitions to learn from.
         seed: seed of the weights. The global random state stays as it is.
     """
-    settings = settings.settled(gamma=0.99, off_policy=True)
+    gamma = 0.99 if settings.gamma is None else settings.gamma
+    settings = replace(settings, form=settings.form or "f", gamma=gamma)
     shared, own = "form state_only gamma", "hidden normalise clamp"
     reward = reward_for(env, AIRLReward, settings, seed=seed, of_all=shared, of_vectors=own)
     reward.fit_scaler(pairs.get("observation"))

@@ -10,7 +10,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple, Self, get_args
 
 import torch
 import torch.nn.functional as F
@@ -99,16 +99,22 @@ class AdversarialConfig(DiscriminatorConfig):
                 "that its last state's value does: leave one of them out."
             )
 
-    def judges_absorbing(self, run: object) -> bool:
-        """Whether absorbing states are judged: as said, or by default off-policy.
+    def settled(self, run: object) -> Self:
+        """These settings with ``absorbing`` as the run's learner needs it, where it is null.
 
         Args:
             run: the run's settings, of which the learner and what follows a failure are read.
+
+        Examples:
+            >>> from giril_rl.config.schema import RewardRunConfig
+            >>> AdversarialConfig().settled(RewardRunConfig()).absorbing
+            False
         """
         if self.absorbing is not None:
-            return self.absorbing
+            return self
         off_policy = getattr(run, "algorithm", "ppo") != "ppo"
-        return off_policy and getattr(run, "termination", "ends") == "ends"
+        ends = getattr(run, "termination", "ends") == "ends"
+        return replace(self, absorbing=off_policy and ends)
 
 
 class DiscriminatorReward(Pretrained, TransitionReward):

@@ -17,7 +17,12 @@ from giril_rl.training.fitting import fit_reward
 from giril_rl.training.loop import Trained, train_policy
 from giril_rl.training.ppo import PPO, return_scaling
 from giril_rl.training.result import finish_run
-from giril_rl.training.reward_trainers import AdversarialTrainer, RewardTrainer, terminal_rate
+from giril_rl.training.reward_trainers import (
+    AdversarialTrainer,
+    RewardTrainer,
+    absorbing_value,
+    terminal_rate,
+)
 from giril_rl.training.scoring import Scores, evaluate, evaluate_both
 
 __all__ = [
@@ -30,6 +35,7 @@ __all__ = [
     "Run",
     "Scores",
     "Trained",
+    "absorbing_value",
     "check_discrete",
     "check_inputs",
     "check_task",

@@ -9,11 +9,13 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
+from torchrl.envs import Transform
 
 from giril_rl.graphs.gradients import TracedGradients
 from giril_rl.rewards.discriminator import AdversarialLoss, DiscriminatorConfig
 from giril_rl.rewards.transitions import TERMINATED
 from giril_rl.runs.randomness import restore_rng, rng_state, seeded, stream_seed
+from giril_rl.transforms.absorbing import AbsorbingReward
 
 
 class RewardTrainer(Protocol):
@@ -200,6 +202,25 @@ class AdversarialTrainer:
         self.optimizer.load_state_dict(state["optimizer"])
         self._rng = state["rng"]
         self._taken = state["taken"]
+
+
+def absorbing_value(reward: Any, gamma: float, weight: float = 1.0) -> list[Transform]:
+    """What a failure leads to, where the reward judges absorbing states: a transform, or none.
+
+    Args:
+        reward: a discriminator's reward.
+        gamma: the learner's discount.
+        weight: the reward's factor, where it is a term of a sum.
+
+    Examples:
+        >>> from torchrl.data import Categorical
+        >>> from giril_rl.rewards import DiscriminatorReward
+        >>> absorbing_value(DiscriminatorReward.for_vectors(2, Categorical(3)), gamma=0.99)
+        []
+    """
+    if reward.absorbing is None:
+        return []
+    return [AbsorbingReward(lambda: weight * reward.absorbing_reward(), gamma)]
 
 
 def terminal_rate(transitions: TensorDictBase) -> float:

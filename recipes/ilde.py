@@ -1,0 +1,127 @@
+"""ILDE: imitation, curiosity about what departs from the demonstration, and a state-entropy bonus.
+
+Demonstration -> discriminator <-> policy on the weighted sum of three rewards -> true score.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from tensordict import TensorDictBase
+from torchrl.envs import Compose, EnvBase, Transform
+
+from giril_rl.config.schema import FitConfig, RewardRunConfig
+from giril_rl.demos import Demonstration, holdout, subsample
+from giril_rl.envs import make_env
+from giril_rl.methods.controls import moments
+from giril_rl.rewards import (
+    AdversarialConfig,
+    AffineReward,
+    BottleneckConfig,
+    BottleneckLoss,
+    DiscriminatorLoss,
+    GenerativeConfig,
+    GenerativeRewardLoss,
+    bottleneck_reward,
+    discriminator_reward,
+    generative_reward,
+)
+from giril_rl.rewards.entropy_bonus import EntropyBonusConfig, entropy_bonus
+from giril_rl.rewards.ilde import ILDEConfig, SummedReward, Term
+from giril_rl.training import (
+    PPO,
+    AdversarialTrainer,
+    Run,
+    absorbing_value,
+    finish_run,
+    fit_reward,
+    make_agent,
+    obtain_demonstration,
+    open_run,
+    return_scaling,
+    terminal_rate,
+    train_policy,
+)
+from giril_rl.transforms import IntrinsicReward
+
+
+@dataclass
+class Config(RewardRunConfig):
+    """What `giril run ilde` takes; settings of a term that is switched off are not read."""
+
+    reward: ILDEConfig = field(default_factory=ILDEConfig)
+    gail: AdversarialConfig = field(default_factory=AdversarialConfig)
+    vail: BottleneckConfig = field(default_factory=BottleneckConfig)
+    giril: GenerativeConfig = field(default_factory=GenerativeConfig)
+    bonus: EntropyBonusConfig = field(default_factory=EntropyBonusConfig)
+    fit: FitConfig = field(default_factory=FitConfig)
+
+
+def main(cfg: Config, out: Path) -> None:
+    """Train the whole chain and leave its run folder in ``out``."""
+    with open_run(cfg, out, recipe=Path(__file__).stem) as run:
+        if run.finished:
+            return
+        demo, expert = obtain_demonstration(cfg)
+        pairs = subsample(demo, cfg.demo.subsample)
+        env = run.closing(make_env(cfg.task, cfg.ppo.num_envs, cfg.seed))
+
+        weights, terms = cfg.reward, {}
+        trainer: AdversarialTrainer | None = None
+        absorbing: list[Transform] = []
+        if weights.imitates:
+            loss, trainer = discriminator(cfg, env, pairs, demo)
+            terms["imitation"] = Term(weights.imitation_weight, loss.reward)
+            absorbing = absorbing_value(loss.reward, cfg.ppo.gamma, weights.imitation_weight)
+        if weights.curiosity_weight:
+            terms["curiosity"] = Term(weights.curiosity_weight, curiosity(cfg, env, demo, run))
+        if weights.bonus_weight:
+            bonus = entropy_bonus(cfg.bonus, env, pairs, seed=cfg.reward_seed).to(cfg.device)
+            terms["bonus"] = Term(weights.bonus_weight, bonus)
+        reward = SummedReward(terms)
+
+        transform = Compose(
+            IntrinsicReward(reward),
+            *absorbing,
+            *return_scaling(cfg.scaling, cfg.ppo.gamma),
+        )
+        agent = make_agent(env, cfg.ppo, cfg.seed).to(cfg.device)
+        ppo = PPO(agent, cfg.ppo, steps=cfg.steps, termination=cfg.termination)
+        trained = train_policy(env, ppo, transform, seed=cfg.seed, run=run, reward_trainer=trainer)
+        finish_run(run, cfg, agent, trained, expert=expert, demo=demo, reward=reward)
+
+
+def discriminator(
+    cfg: Config, env: EnvBase, pairs: TensorDictBase, demo: Demonstration
+) -> tuple[DiscriminatorLoss, AdversarialTrainer]:
+    """GAIL's discriminator or VAIL's, and what trains it beside the policy."""
+    seed = cfg.reward_seed
+    loss: DiscriminatorLoss
+    settings: AdversarialConfig
+    if cfg.reward.imitation == "gail":
+        settings = cfg.gail.settled(cfg)
+        reward = discriminator_reward(settings, env, pairs, seed=seed).to(cfg.device)
+        loss = DiscriminatorLoss(reward, penalty=settings.penalty)
+    else:
+        settings = vail = cfg.vail.settled(cfg)
+        reward = bottleneck_reward(vail, env, pairs, seed=seed).to(cfg.device)
+        loss = BottleneckLoss(
+            reward,
+            information=vail.information,
+            beta_step=vail.beta_step,
+            beta=vail.beta_start,
+            penalty=vail.penalty,
+        )
+    rate = terminal_rate(demo.transitions)
+    return loss, AdversarialTrainer(loss, pairs, settings, seed=seed, terminal_rate=rate)
+
+
+def curiosity(cfg: Config, env: EnvBase, demo: Demonstration, run: Run) -> Any:
+    """GIRIL's error, trained, over its mean on the demonstration."""
+    pairs, validation = subsample(demo, cfg.demo.subsample), holdout(demo, cfg.demo.subsample)
+    reward = generative_reward(cfg.giril, env, pairs, seed=cfg.reward_seed).to(cfg.device)
+    loss = GenerativeRewardLoss(reward, alpha=cfg.giril.alpha)
+    fit_reward(loss, pairs, cfg.fit, seed=cfg.reward_seed, run=run, validation=validation)
+    return AffineReward(reward, scale=1 / moments(reward, pairs)[0]).to(cfg.device)
