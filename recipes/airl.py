@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from torch import Tensor
 from torchrl.envs import Compose
 
 from giril_rl.config.schema import RewardRunConfig
@@ -15,10 +16,9 @@ from giril_rl.demos import subsample
 from giril_rl.envs import make_env
 from giril_rl.rewards.airl import AIRLConfig, AIRLLoss, airl_reward, with_log_prob
 from giril_rl.training import (
-    PPO,
     AdversarialTrainer,
     finish_run,
-    make_agent,
+    make_algorithm,
     obtain_demonstration,
     open_run,
     return_scaling,
@@ -41,18 +41,21 @@ def main(cfg: Config, out: Path) -> None:
             return
         demo, expert = obtain_demonstration(cfg)
         pairs = subsample(demo, cfg.demo.subsample)
-        env = run.closing(make_env(cfg.task, cfg.ppo.num_envs, cfg.seed))
-        agent = make_agent(env, cfg.ppo, cfg.seed).to(cfg.device)
+        env = run.closing(make_env(cfg.task, cfg.learner.num_envs, cfg.seed))
+
+        def log_prob(observation: Tensor, action: Tensor) -> Tensor:
+            return learner.agent.log_prob(observation, action)
 
         seed, settings = cfg.reward_seed, cfg.reward.settled(cfg)
         reward = airl_reward(settings, env, pairs, seed=seed).to(cfg.device)
         loss = AIRLLoss(reward, penalty=settings.penalty)
-        trainer = AdversarialTrainer(loss, pairs, settings, seed=seed, log_prob=agent.log_prob)
 
-        transform = Compose(
-            IntrinsicReward(with_log_prob(reward, agent.log_prob)),
-            *return_scaling(cfg.scaling, cfg.ppo.gamma),
+        transform = Compose(IntrinsicReward(with_log_prob(reward, log_prob)), *return_scaling(cfg))
+        learner = make_algorithm(env, cfg, run=run, demo=demo, transform=transform, moving=True)
+        trainer = AdversarialTrainer(
+            loss, pairs, settings, seed=seed, source=learner.own, log_prob=log_prob
         )
-        ppo = PPO(agent, cfg.ppo, steps=cfg.steps, termination=cfg.termination)
-        trained = train_policy(env, ppo, transform, seed=cfg.seed, run=run, reward_trainer=trainer)
-        finish_run(run, cfg, agent, trained, expert=expert, demo=demo, reward=reward)
+        trained = train_policy(
+            env, learner, transform, seed=cfg.seed, run=run, reward_trainer=trainer
+        )
+        finish_run(run, cfg, learner.agent, trained, expert=expert, demo=demo, reward=reward)

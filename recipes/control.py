@@ -13,10 +13,9 @@ from torchrl.envs import Compose
 from giril_rl.envs import make_env
 from giril_rl.methods import ControlRunConfig, baseline_policy, check_baseline, control_reward
 from giril_rl.training import (
-    PPO,
     Trained,
     finish_run,
-    make_agent,
+    make_algorithm,
     obtain_demonstration,
     open_run,
     return_scaling,
@@ -41,16 +40,17 @@ def main(cfg: Config, out: Path) -> None:
             finish_run(run, cfg, baseline, Trained())
             return
         demo, expert = obtain_demonstration(cfg) if cfg.needs_demonstration else (None, None)
-        env = run.closing(make_env(cfg.task, cfg.ppo.num_envs, cfg.seed))
+        env = run.closing(make_env(cfg.task, cfg.learner.num_envs, cfg.seed))
 
         reward, seeds = control_reward(cfg, env, demo, run)
 
         transform = Compose(
             IntrinsicReward(reward),
             *[BatchMeanReward()] * cfg.batch_mean,
-            *return_scaling(cfg.scaling, cfg.ppo.gamma),
+            *return_scaling(cfg),
         )
-        agent = make_agent(env, cfg.ppo, cfg.seed).to(cfg.device)
-        ppo = PPO(agent, cfg.ppo, steps=cfg.steps, termination=cfg.termination)
-        trained = train_policy(env, ppo, transform, seed=cfg.seed, run=run)
-        finish_run(run, cfg, agent, trained, expert=expert, demo=demo, reward=reward, seeds=seeds)
+        learner = make_algorithm(env, cfg, run=run, demo=demo, transform=transform)
+        trained = train_policy(env, learner, transform, seed=cfg.seed, run=run)
+        finish_run(
+            run, cfg, learner.agent, trained, expert=expert, demo=demo, reward=reward, seeds=seeds
+        )

@@ -29,15 +29,14 @@ from giril_rl.rewards import (
     generative_reward,
 )
 from giril_rl.rewards.entropy_bonus import EntropyBonusConfig, entropy_bonus
-from giril_rl.rewards.ilde import ILDEConfig, SummedReward, Term
+from giril_rl.rewards.ilde import ILDEConfig, InMinibatches, SummedReward, Term
 from giril_rl.training import (
-    PPO,
     AdversarialTrainer,
     Run,
     absorbing_value,
     finish_run,
     fit_reward,
-    make_agent,
+    make_algorithm,
     obtain_demonstration,
     open_run,
     return_scaling,
@@ -66,56 +65,59 @@ def main(cfg: Config, out: Path) -> None:
             return
         demo, expert = obtain_demonstration(cfg)
         pairs = subsample(demo, cfg.demo.subsample)
-        env = run.closing(make_env(cfg.task, cfg.ppo.num_envs, cfg.seed))
+        env = run.closing(make_env(cfg.task, cfg.learner.num_envs, cfg.seed))
 
         weights, terms = cfg.reward, {}
-        trainer: AdversarialTrainer | None = None
+        loss: DiscriminatorLoss | None = None
         absorbing: list[Transform] = []
         if weights.imitates:
-            loss, trainer = discriminator(cfg, env, pairs, demo)
+            loss = discriminator(cfg, env, pairs)
             terms["imitation"] = Term(weights.imitation_weight, loss.reward)
-            absorbing = absorbing_value(loss.reward, cfg.ppo.gamma, weights.imitation_weight)
+            absorbing = absorbing_value(loss.reward, cfg.learner.gamma, weights.imitation_weight)
         if weights.curiosity_weight:
             terms["curiosity"] = Term(weights.curiosity_weight, curiosity(cfg, env, demo, run))
         if weights.bonus_weight:
             bonus = entropy_bonus(cfg.bonus, env, pairs, seed=cfg.reward_seed).to(cfg.device)
-            terms["bonus"] = Term(weights.bonus_weight, bonus)
+            terms["bonus"] = Term(weights.bonus_weight, InMinibatches(bonus, cfg.sac.batch))
         reward = SummedReward(terms)
 
-        transform = Compose(
-            IntrinsicReward(reward),
-            *absorbing,
-            *return_scaling(cfg.scaling, cfg.ppo.gamma),
+        transform = Compose(IntrinsicReward(reward), *absorbing, *return_scaling(cfg))
+        moving = weights.imitates or weights.bonus_weight > 0
+        learner = make_algorithm(env, cfg, run=run, demo=demo, transform=transform, moving=moving)
+        trainer = None
+        if loss is not None:
+            trainer = AdversarialTrainer(
+                loss,
+                pairs,
+                settings_of(cfg),
+                seed=cfg.reward_seed,
+                source=learner.own,
+                terminal_rate=terminal_rate(demo.transitions),
+            )
+        trained = train_policy(
+            env, learner, transform, seed=cfg.seed, run=run, reward_trainer=trainer
         )
-        agent = make_agent(env, cfg.ppo, cfg.seed).to(cfg.device)
-        ppo = PPO(agent, cfg.ppo, steps=cfg.steps, termination=cfg.termination)
-        trained = train_policy(env, ppo, transform, seed=cfg.seed, run=run, reward_trainer=trainer)
-        finish_run(run, cfg, agent, trained, expert=expert, demo=demo, reward=reward)
+        finish_run(run, cfg, learner.agent, trained, expert=expert, demo=demo, reward=reward)
 
 
-def discriminator(
-    cfg: Config, env: EnvBase, pairs: TensorDictBase, demo: Demonstration
-) -> tuple[DiscriminatorLoss, AdversarialTrainer]:
-    """GAIL's discriminator or VAIL's, and what trains it beside the policy."""
-    seed = cfg.reward_seed
-    loss: DiscriminatorLoss
-    settings: AdversarialConfig
-    if cfg.reward.imitation == "gail":
-        settings = cfg.gail.settled(cfg)
+def settings_of(cfg: Config) -> AdversarialConfig:
+    """The chosen discriminator's settings, as the learner needs them."""
+    return (cfg.gail if cfg.reward.imitation == "gail" else cfg.vail).settled(cfg)
+
+
+def discriminator(cfg: Config, env: EnvBase, pairs: TensorDictBase) -> DiscriminatorLoss:
+    """The loss of GAIL's discriminator or VAIL's, untrained."""
+    settings, seed = settings_of(cfg), cfg.reward_seed
+    if not isinstance(settings, BottleneckConfig):
         reward = discriminator_reward(settings, env, pairs, seed=seed).to(cfg.device)
-        loss = DiscriminatorLoss(reward, penalty=settings.penalty)
-    else:
-        settings = vail = cfg.vail.settled(cfg)
-        reward = bottleneck_reward(vail, env, pairs, seed=seed).to(cfg.device)
-        loss = BottleneckLoss(
-            reward,
-            information=vail.information,
-            beta_step=vail.beta_step,
-            beta=vail.beta_start,
-            penalty=vail.penalty,
-        )
-    rate = terminal_rate(demo.transitions)
-    return loss, AdversarialTrainer(loss, pairs, settings, seed=seed, terminal_rate=rate)
+        return DiscriminatorLoss(reward, penalty=settings.penalty)
+    return BottleneckLoss(
+        bottleneck_reward(settings, env, pairs, seed=seed).to(cfg.device),
+        information=settings.information,
+        beta_step=settings.beta_step,
+        beta=settings.beta_start,
+        penalty=settings.penalty,
+    )
 
 
 def curiosity(cfg: Config, env: EnvBase, demo: Demonstration, run: Run) -> Any:

@@ -15,10 +15,9 @@ from giril_rl.demos import holdout, subsample
 from giril_rl.envs import make_env
 from giril_rl.rewards.red import DistillationConfig, DistillationLoss, red_reward
 from giril_rl.training import (
-    PPO,
     finish_run,
     fit_reward,
-    make_agent,
+    make_algorithm,
     obtain_demonstration,
     open_run,
     return_scaling,
@@ -42,7 +41,7 @@ def main(cfg: Config, out: Path) -> None:
             return
         demo, expert = obtain_demonstration(cfg)
         pairs, validation = subsample(demo, cfg.demo.subsample), holdout(demo, cfg.demo.subsample)
-        env = run.closing(make_env(cfg.task, cfg.ppo.num_envs, cfg.seed))
+        env = run.closing(make_env(cfg.task, cfg.learner.num_envs, cfg.seed))
 
         seed = cfg.reward_seed
         reward = red_reward(cfg.reward, env, pairs, seed=seed).to(cfg.device)
@@ -53,9 +52,8 @@ def main(cfg: Config, out: Path) -> None:
 
         transform = Compose(
             IntrinsicReward(reward),
-            *return_scaling(cfg.scaling, cfg.ppo.gamma),
+            *return_scaling(cfg),
         )
-        agent = make_agent(env, cfg.ppo, cfg.seed).to(cfg.device)
-        ppo = PPO(agent, cfg.ppo, steps=cfg.steps, termination=cfg.termination)
-        trained = train_policy(env, ppo, transform, seed=cfg.seed, run=run)
-        finish_run(run, cfg, agent, trained, expert=expert, demo=demo, reward=reward)
+        learner = make_algorithm(env, cfg, run=run, demo=demo, transform=transform)
+        trained = train_policy(env, learner, transform, seed=cfg.seed, run=run)
+        finish_run(run, cfg, learner.agent, trained, expert=expert, demo=demo, reward=reward)

@@ -1,6 +1,6 @@
 """VAIL: GAIL with a discriminator that sees a pair only through an information bottleneck.
 
-Demonstration -> discriminator <-> PPO on its reward -> score on the true reward.
+Demonstration -> discriminator <-> policy on its reward -> score on the true reward.
 """
 
 from __future__ import annotations
@@ -15,11 +15,10 @@ from giril_rl.demos import subsample
 from giril_rl.envs import make_env
 from giril_rl.rewards import BottleneckConfig, BottleneckLoss, bottleneck_reward
 from giril_rl.training import (
-    PPO,
     AdversarialTrainer,
     absorbing_value,
     finish_run,
-    make_agent,
+    make_algorithm,
     obtain_demonstration,
     open_run,
     return_scaling,
@@ -43,7 +42,7 @@ def main(cfg: Config, out: Path) -> None:
             return
         demo, expert = obtain_demonstration(cfg)
         pairs = subsample(demo, cfg.demo.subsample)
-        env = run.closing(make_env(cfg.task, cfg.ppo.num_envs, cfg.seed))
+        env = run.closing(make_env(cfg.task, cfg.learner.num_envs, cfg.seed))
 
         seed = cfg.reward_seed
         settings = cfg.reward.settled(cfg)
@@ -55,15 +54,22 @@ def main(cfg: Config, out: Path) -> None:
             beta=cfg.reward.beta_start,
             penalty=cfg.reward.penalty,
         )
-        rate = terminal_rate(demo.transitions)
-        trainer = AdversarialTrainer(loss, pairs, settings, seed=seed, terminal_rate=rate)
 
         transform = Compose(
             IntrinsicReward(reward),
-            *absorbing_value(reward, cfg.ppo.gamma),
-            *return_scaling(cfg.scaling, cfg.ppo.gamma),
+            *absorbing_value(reward, cfg.learner.gamma),
+            *return_scaling(cfg),
         )
-        agent = make_agent(env, cfg.ppo, cfg.seed).to(cfg.device)
-        ppo = PPO(agent, cfg.ppo, steps=cfg.steps, termination=cfg.termination)
-        trained = train_policy(env, ppo, transform, seed=cfg.seed, run=run, reward_trainer=trainer)
-        finish_run(run, cfg, agent, trained, expert=expert, demo=demo, reward=reward)
+        learner = make_algorithm(env, cfg, run=run, demo=demo, transform=transform, moving=True)
+        trainer = AdversarialTrainer(
+            loss,
+            pairs,
+            settings,
+            seed=seed,
+            source=learner.own,
+            terminal_rate=terminal_rate(demo.transitions),
+        )
+        trained = train_policy(
+            env, learner, transform, seed=cfg.seed, run=run, reward_trainer=trainer
+        )
+        finish_run(run, cfg, learner.agent, trained, expert=expert, demo=demo, reward=reward)

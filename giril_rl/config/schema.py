@@ -138,6 +138,66 @@ class PPOConfig:
 
 
 @dataclass
+class SACConfig:
+    """Soft actor-critic: off-policy, from a replay buffer that may begin with the demonstration."""
+
+    num_envs: int = knob(8, "parallel environments", low=1)
+    rollout: int = knob(8, "steps per environment between updates", low=1)
+    updates: float = knob(
+        0.5, "gradient steps for each environment step", low=0, low_open=True, high=64
+    )
+    batch: int = knob(128, "transitions per gradient step", low=1)
+    lr: float = knob(1e-3, "Adam step size of actor, critics and temperature", low=0, low_open=True)
+    gamma: float = knob(0.99, "discount", low=0, high=1)
+    tau: float = knob(
+        0.005, "how far target critics move to the critics each step", low=0, low_open=True, high=1
+    )
+    hidden: list[int] = knob([128, 128], "hidden layers of actor and critics (ReLU)", low=1)
+    normalise_observations: bool = knob(False, "running observation normalisation, clipped at 10")
+    entropy: str = knob(
+        "tuned",
+        "tuned: the temperature holds target_entropy; fixed: it stays; none: a deterministic actor "
+        "(discrete: without a bonus) that explores with fixed noise",
+        choices=("tuned", "fixed", "none"),
+    )
+    temperature: float = knob(
+        1.0, "initial temperature of the entropy bonus, or the fixed one", low=0, low_open=True
+    )
+    target_entropy: float | None = knob(
+        None,
+        "entropy=tuned: null takes minus the number of action dimensions; discrete: 0.98 of the "
+        "most that there is",
+    )
+    noise: float = knob(
+        0.1,
+        "entropy=none: standard deviation of the noise, before squashing to the bounds",
+        low=0,
+        low_open=True,
+    )
+    random_steps: int = knob(1_000, "environment steps of random actions before learning", low=0)
+    buffer_size: int = knob(1_000_000, "transitions in the replay buffer, on disk", low=1)
+    demonstration: str = knob(
+        "seed",
+        "in the replay: seed adds its transitions to the agent's; half makes them half of each "
+        "minibatch; none leaves them out",
+        choices=("seed", "half", "none"),
+    )
+    checkpoint_every: int = knob(20_000, "environment steps between checkpoints", low=1)
+    log_every: int = knob(1_000, "environment steps between rows of metrics", low=1)
+    compile: bool = knob(False, f"{COMPILE}; of the acting policy as well")
+
+    def whole_batches(self, steps: int) -> int:
+        """``steps``, rounded up to the end of a batch.
+
+        Examples:
+            >>> SACConfig(num_envs=8, rollout=8).whole_batches(1_000)
+            1024
+        """
+        batch = self.num_envs * self.rollout
+        return -(-steps // batch) * batch
+
+
+@dataclass
 class ExpertConfig:
     """The player whose demonstration is imitated: PPO on the true reward."""
 
@@ -291,8 +351,17 @@ class RunConfig:
         "where networks and batches are; environments stay on the CPU",
         choices=("cpu", "cuda"),
     )
+    algorithm: str = knob(
+        "ppo", "what learns from the reward: on-policy or off-policy", choices=("ppo", "sac")
+    )
     ppo: PPOConfig = field(default_factory=PPOConfig)
+    sac: SACConfig = field(default_factory=SACConfig)
     eval: EvalConfig = field(default_factory=EvalConfig)
+
+    @property
+    def learner(self) -> PPOConfig | SACConfig:
+        """The settings of the chosen algorithm."""
+        return self.sac if self.algorithm == "sac" else self.ppo
 
 
 @dataclass

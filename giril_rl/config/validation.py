@@ -14,6 +14,7 @@ from giril_rl.config.schema import (
     ExpertConfig,
     PPOConfig,
     RunConfig,
+    SACConfig,
 )
 from giril_rl.config.tasks import apply_task_defaults
 from giril_rl.errors import UserError
@@ -65,6 +66,11 @@ def _check_run(config: RunConfig) -> None:
     for field in fields(config):
         _check_observations(field.name, getattr(config, field.name), config)
     images = config.task.family.observation == "image"
+    if images and config.algorithm == "sac":
+        raise UserError(
+            f"algorithm=sac has no networks for frames, which {config.task.name} has: set "
+            "algorithm=ppo."
+        )
     if images and config.ppo.normalise_observations:
         raise UserError(
             f"ppo.normalise_observations=true is for vectors, and {config.task.name} has frames, "
@@ -106,7 +112,7 @@ def notices(config: Any) -> list[str]:
     found = []
     trains = getattr(config, "trains", True)  # A random policy and a held action do not.
     if isinstance(config, RunConfig) and trains:  # Cloning has 0 steps.
-        found += _rounding("steps", config.steps, config.ppo)
+        found += _rounding("steps", config.steps, config.learner)
     expert, demo = getattr(config, "expert", None), getattr(config, "demo", None)
     recorded = not isinstance(demo, DemoConfig) or demo.path is None
     needed = getattr(config, "needs_demonstration", True)
@@ -118,9 +124,9 @@ def notices(config: Any) -> list[str]:
     return found
 
 
-def _rounding(key: str, steps: int, ppo: PPOConfig) -> list[str]:
-    taken = ppo.whole_batches(steps)
+def _rounding(key: str, steps: int, learner: PPOConfig | SACConfig) -> list[str]:
+    taken = learner.whole_batches(steps)
     if steps == taken:
         return []
-    batch = f"{ppo.num_envs} * {ppo.rollout} = {ppo.num_envs * ppo.rollout:,}"
+    batch = f"{learner.num_envs} * {learner.rollout} = {learner.num_envs * learner.rollout:,}"
     return [f"{key}={steps} is no multiple of a batch ({batch}): {taken:,} steps are taken."]

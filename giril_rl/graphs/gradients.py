@@ -8,6 +8,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
+from giril_rl.graphs.functional import FunctionalLoss
 from giril_rl.graphs.recording import ModuleGraph, convolves
 
 
@@ -57,7 +58,7 @@ class TracedGradients:
         max_grad_norm: float | None = None,
         compile: bool = False,
     ) -> None:
-        self._loss = _Holder(loss)
+        self._loss = FunctionalLoss(loss) if FunctionalLoss.is_needed(loss) else _Holder(loss)
         self._keys = list(keys)
         self._log = list(log)
         self._max_grad_norm = max_grad_norm

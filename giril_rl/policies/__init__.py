@@ -10,8 +10,10 @@ from giril_rl.policies.making import (
     load_agent,
     load_agent_from,
     make_agent,
+    make_sac_agent,
 )
 from giril_rl.policies.pixel_actor_critic import PixelActorCritic
+from giril_rl.policies.soft_actor_critic import SACAgent
 
 __all__ = [
     "NORMALISED",
@@ -22,6 +24,7 @@ __all__ = [
     "PPOAgent",
     "PixelActorCritic",
     "RecordedActing",
+    "SACAgent",
     "agent_for",
     "check_actions",
     "collecting",
@@ -29,4 +32,5 @@ __all__ = [
     "load_agent",
     "load_agent_from",
     "make_agent",
+    "make_sac_agent",
 ]

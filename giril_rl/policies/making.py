@@ -10,16 +10,18 @@ from typing import Any
 from torchrl.data import Categorical
 from torchrl.envs import EnvBase
 
-from giril_rl.config.schema import PPOConfig, TaskConfig
+from giril_rl.config.schema import PPOConfig, SACConfig, TaskConfig
 from giril_rl.envs import BatchedEnv, make_env, observation_kind
 from giril_rl.errors import UserError
 from giril_rl.networks.action_bounds import single_action_spec, unsupported
 from giril_rl.policies.actor_critic import ActorCritic, PPOAgent
 from giril_rl.policies.agent import Agent
 from giril_rl.policies.pixel_actor_critic import PixelActorCritic
+from giril_rl.policies.soft_actor_critic import SACAgent
 from giril_rl.runs.pretrained import made_class, plain
 from giril_rl.runs.randomness import Use, seeded, stream_seed
 
+NO_FRAMES = "SAC has no networks for frames here: set algorithm=ppo."
 POLICY = "policy"
 """The folder of a run that holds its policy, see :class:`giril_rl.runs.pretrained.Pretrained`."""
 
@@ -61,7 +63,32 @@ def make_agent(env: BatchedEnv, cfg: PPOConfig, seed: int, *, use: Use = "traini
         return agent_for(env, hidden=cfg.hidden, normalise=cfg.normalise_observations)
 
 
-def load_agent_from(folder: Path | str) -> PPOAgent:
+def make_sac_agent(
+    env: BatchedEnv, cfg: SACConfig, seed: int, *, use: Use = "training"
+) -> SACAgent:
+    """SAC's untrained agent for ``env``, initialised from ``use`` and ``seed`` alone.
+
+    Raises:
+        UserError: for frames, and actions that SAC has no form for.
+
+    Examples:
+        >>> env = make_env(TaskConfig(name="cartpole", env_id="CartPole-v1"), num_envs=1, seed=0)
+        >>> make_sac_agent(env, SACConfig(), seed=0).discrete
+        True
+    """
+    if observation_kind(env) == "image":
+        raise UserError(NO_FRAMES)
+    with seeded(stream_seed(use, seed)):
+        return SACAgent(
+            env.observation_spec["observation"].shape[-1],
+            env.action_spec,
+            hidden=cfg.hidden,
+            normalise=cfg.normalise_observations,
+            noise=cfg.noise if cfg.entropy == "none" else None,
+        )
+
+
+def load_agent_from(folder: Path | str) -> Agent:
     """The agent that its ``save_pretrained`` wrote, of whichever class.
 
     Args:
@@ -77,11 +104,11 @@ def load_agent_from(folder: Path | str) -> PPOAgent:
         >>> policy.out_keys
         ['action', 'action_log_prob', 'state_value']
     """
-    kinds: dict[str, type[Any]] = {x.__name__: x for x in (ActorCritic, PixelActorCritic)}
+    kinds: dict[str, type[Any]] = {x.__name__: x for x in (ActorCritic, PixelActorCritic, SACAgent)}
     return kinds.get(made_class(folder) or "", ActorCritic).from_pretrained(folder)
 
 
-def load_agent(run: Path, task: TaskConfig) -> PPOAgent:
+def load_agent(run: Path, task: TaskConfig) -> Agent:
     """The policy of a finished run.
 
     Raises:
@@ -118,9 +145,8 @@ def fits(agent: Agent, env: EnvBase) -> bool:
     """
     kind, needs = _needed(env)
     made_with = _made_with(agent)
-    return type(agent) is kind and all(
-        made_with.get(name) == plain(value) for name, value in needs.items()
-    )
+    is_kind = type(agent) is kind or (kind is ActorCritic and type(agent) is SACAgent)
+    return is_kind and all(made_with.get(name) == plain(value) for name, value in needs.items())
 
 
 def check_actions(agent: object, env: EnvBase) -> None:

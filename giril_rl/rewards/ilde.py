@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
@@ -105,6 +106,42 @@ class SummedReward(TensorDictModuleBase):
             term = self.weights[name] * module(tensordict.select(*in_keys)).get(out_key)
             total = term if total is None else total + term
         return tensordict.set(self.out_keys[0], total)
+
+
+class InMinibatches(TensorDictModuleBase):
+    """Computes a reward of a batch for each minibatch of a flat batch by itself.
+
+    An off-policy learner draws the minibatches of several gradient steps at once. A batch with more
+    than one dimension, such as the one that was collected, stays whole.
+
+    Args:
+        module: the reward, which depends on the batch that it is computed with.
+        size: transitions in a minibatch.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> from giril_rl.rewards.entropy_bonus import EntropyBonus
+        >>> from giril_rl.rewards import ObservationScaler
+        >>> bonus = EntropyBonus(ObservationScaler(1, rule="raw", clamp=False), k=1)
+        >>> s = torch.tensor([[0.0], [1.0], [1.0], [1.0]])
+        >>> batch = TensorDict({"next": {"observation": s}}, [4])
+        >>> InMinibatches(bonus, size=2)(batch)["next", "intrinsic_reward"].exp().flatten()
+        tensor([2., 2., 1., 1.])
+    """
+
+    def __init__(self, module: TensorDictModuleBase, size: int) -> None:
+        super().__init__()
+        self.module, self.size = module, size
+        self.in_keys: list[NestedKey] = list(module.in_keys)
+        self.out_keys: list[NestedKey] = list(module.out_keys)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Writes the reward."""
+        if tensordict.ndim != 1:
+            return self.module(tensordict)
+        parts = tensordict.select(*self.in_keys).split(self.size)
+        computed = [self.module(part).get(self.out_keys[0]) for part in parts]
+        return tensordict.set(self.out_keys[0], torch.cat(computed))
 
 
 register(Method("ilde", "ILDE", GREY, trained="beside", settings=ILDEConfig))

@@ -27,8 +27,8 @@ from giril_rl.files.disk import read_json
 NO_EFFECT = frozenset(
     {
         *("out", "root", "imports", "logger", "threads", "device"),
-        *("ppo.compile", "fit.compile", "reward.compile"),
-        *("ppo.checkpoint_every", "fit.log_every"),
+        *("ppo.compile", "sac.compile", "fit.compile", "reward.compile"),
+        *("ppo.checkpoint_every", "sac.checkpoint_every", "sac.log_every", "fit.log_every"),
         *("eval.episodes", "eval.seed"),
         "task.demonstration",  # It acts through demo.path.
     }
@@ -44,6 +44,7 @@ ADDED = {
     "task.after_failure": "reset",
     "task.episode": "life",
     "termination": "ends",
+    "algorithm": "ppo",
     "ppo.clip_value": False,
     "demo.lives": "first",
     "clip_reward": False,
@@ -102,9 +103,20 @@ def config_hash(config: Any) -> str:
         >>> config_hash(RunConfig(seed=1)) == config_hash(RunConfig(seed=1, root="elsewhere"))
         True
     """
-    values = without_added({**RETIRED, **asdict(config)}, drop=NO_EFFECT)
+    values = without_added({**RETIRED, **read(asdict(config))}, drop=NO_EFFECT)
     text = json.dumps([EDITION, values], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:12]
+
+
+def read(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings without those of the algorithm that does not run.
+
+    Examples:
+        >>> read({"algorithm": "sac", "ppo": {"lr": 0.1}, "sac": {"lr": 0.2}})
+        {'algorithm': 'sac', 'sac': {'lr': 0.2}}
+    """
+    other = "ppo" if values.get("algorithm", "ppo") == "sac" else "sac"
+    return {name: value for name, value in values.items() if name != other}
 
 
 def differences(
@@ -117,7 +129,7 @@ def differences(
         ['ppo.lr: 0.1 there, 0.2 now']
     """
     now = {**{key: before[key] for key in RETIRED if key in before}, **now}
-    old, new = (flat(without_added(config), keep_empty=True) for config in (before, now))
+    old, new = (flat(without_added(read(config)), keep_empty=True) for config in (before, now))
     return [
         f"{key}: {old.get(key, 'nothing')!s} there, {new.get(key, 'nothing')!s} now"
         for key in [*new, *(key for key in old if key not in new)]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -78,6 +78,67 @@ class MetricsFile:
 
     def _rewrite(self, rows: list[dict[str, Any]]) -> None:
         write_atomically(self.path, "".join(json.dumps(row) + "\n" for row in rows))
+
+
+class MetricMeans:
+    """Gathers the measurements of several batches for one row.
+
+    Means are weighted; a single batch's measurements stay as they are, bit for bit.
+
+    Examples:
+        >>> means = MetricMeans()
+        >>> means.add({"loss": 1.0, "episodes": 1.0, "return": 5.0}, totals=["episodes"])
+        >>> means.add({"loss": 2.0, "episodes": 3.0, "return": 9.0}, totals=["episodes"],
+        ...           weights={"return": 3.0})
+        >>> means.take()
+        {'loss': 1.5, 'episodes': 4.0, 'return': 8.0}
+        >>> means.take()
+        {}
+    """
+
+    def __init__(self) -> None:
+        self._values: dict[str, list[list[float]]] = {}
+        self._totals: list[str] = []
+
+    def add(
+        self,
+        values: Mapping[str, float],
+        *,
+        totals: Collection[str] = (),
+        weights: Mapping[str, float] | None = None,
+    ) -> None:
+        """Adds one batch's measurements.
+
+        Args:
+            values: by name.
+            totals: names of those that are added up rather than averaged.
+            weights: of those that do not weigh 1.
+        """
+        for name, value in values.items():
+            self._values.setdefault(name, []).append([value, (weights or {}).get(name, 1.0)])
+        self._totals = sorted({*self._totals, *totals})
+
+    def take(self) -> dict[str, float]:
+        """Totals and means of what was added since the last time."""
+        row = {name: self._one(name, pairs) for name, pairs in self._values.items()}
+        self._values = {}
+        return row
+
+    def _one(self, name: str, pairs: list[list[float]]) -> float:
+        if len(pairs) == 1:
+            return pairs[0][0]
+        if name in self._totals:
+            return math.fsum(value for value, _ in pairs)
+        total = math.fsum(weight for _, weight in pairs)
+        return math.fsum(value * weight for value, weight in pairs) / total
+
+    def state_dict(self) -> dict[str, Any]:
+        """What was added and not taken yet."""
+        return {"values": self._values, "totals": self._totals}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restores what :meth:`state_dict` gave."""
+        self._values, self._totals = dict(state["values"]), list(state["totals"])
 
 
 def _ends_a_line(path: Path) -> bool:

@@ -3,7 +3,7 @@
 from giril_rl.moved import forwarding
 from giril_rl.policies import load_agent, make_agent
 from giril_rl.runs.run import Run
-from giril_rl.training.algorithm import Algorithm
+from giril_rl.training.algorithm import Algorithm, make_algorithm
 from giril_rl.training.baselines import (
     HeldAction,
     RandomPolicy,
@@ -23,10 +23,12 @@ from giril_rl.training.reward_trainers import (
     absorbing_value,
     terminal_rate,
 )
+from giril_rl.training.sac import SAC
 from giril_rl.training.scoring import Scores, evaluate, evaluate_both
 
 __all__ = [
     "PPO",
+    "SAC",
     "AdversarialTrainer",
     "Algorithm",
     "HeldAction",
@@ -47,6 +49,7 @@ __all__ = [
     "held_action_scores",
     "load_agent",
     "make_agent",
+    "make_algorithm",
     "obtain_demonstration",
     "open_run",
     "return_scaling",

@@ -1,13 +1,29 @@
-"""What the training loop asks of a reinforcement learning algorithm."""
+"""What the training loop asks of a reinforcement learning algorithm, and the chosen one made."""
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any, Protocol, cast
 
+import torch
 from tensordict import TensorDictBase
+from torch import Tensor, nn
 
+from giril_rl.config.schema import RunConfig, ScalingConfig
+from giril_rl.demos import Demonstration
+from giril_rl.envs import BatchedEnv
+from giril_rl.errors import UserError
 from giril_rl.policies.agent import Agent
+from giril_rl.policies.making import make_agent, make_sac_agent
+from giril_rl.runs.randomness import Use
+from giril_rl.runs.run import Run
+from giril_rl.training.ppo import PPO
+from giril_rl.training.sac import SAC
+from giril_rl.transforms.scaling import ResetRule, ReturnScaling
+
+REPLAY = "replay"
+"""The folder of a run that holds its replay buffer until training is over."""
 
 
 class Algorithm(Protocol):
@@ -20,12 +36,16 @@ class Algorithm(Protocol):
         frames_per_batch: transitions that are collected between two updates.
         steps: environment steps of the whole training, in whole batches.
         checkpoint_every: environment steps between checkpoints.
+        log_every: environment steps between rows of metrics.
+        name: of its metrics and checkpoint.
     """
 
+    name: str
     num_envs: int
     frames_per_batch: int
     steps: int
     checkpoint_every: int
+    log_every: int
 
     @property
     def agent(self) -> Agent:
@@ -40,7 +60,7 @@ class Algorithm(Protocol):
         """Learns from a batch ``(num_envs, time)`` with the reward to learn from.
 
         Returns:
-            What is to be logged.
+            What is to be logged; of several batches the means are.
         """
         ...
 
@@ -51,3 +71,89 @@ class Algorithm(Protocol):
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restores what :meth:`state_dict` gave."""
         ...
+
+    def close(self) -> None:
+        """Frees what only further training needs, once training is over."""
+        ...
+
+
+def make_algorithm(
+    env: BatchedEnv,
+    cfg: RunConfig,
+    *,
+    run: Run,
+    demo: Demonstration | None = None,
+    transform: nn.Module | None = None,
+    moving: bool = False,
+    demonstration_reward: float | None = None,
+    absorbing: Callable[[], Tensor] | None = None,
+    use: Use = "training",
+) -> PPO | SAC:
+    """The algorithm that ``cfg.algorithm`` names, with an untrained agent for ``env``.
+
+    Args:
+        env: the training environments, for their specs.
+        cfg: the run's settings.
+        run: whose folder SAC's replay buffer is in.
+        demo: the demonstration, for SAC's replay buffer.
+        transform: what writes the reward, as the training loop gets it.
+        moving: whether the reward model learns beside the policy, so that SAC computes the reward
+            anew for each minibatch.
+        demonstration_reward: the reward of each demonstrated transition in SAC's replay buffer;
+            None lets ``transform`` compute it.
+        absorbing: see :class:`~giril_rl.training.sac.SAC`.
+        use: what the random numbers are for.
+
+    Raises:
+        UserError: if the algorithm has no form for the environment's spaces, or the replay buffer
+            is smaller than the demonstration.
+    """
+    termination = getattr(cfg, "termination", "ends")
+    if cfg.algorithm == "ppo":
+        agent = make_agent(env, cfg.ppo, cfg.seed, use=use).to(cfg.device)
+        return PPO(agent, cfg.ppo, steps=cfg.steps, termination=termination)
+    known = None
+    if demo is not None and cfg.sac.demonstration != "none":
+        known = _demonstrated(demo, cfg, transform, moving, demonstration_reward)
+    scaling = getattr(cfg, "scaling", None)
+    return SAC(
+        make_sac_agent(env, cfg.sac, cfg.seed, use=use).to(cfg.device),
+        cfg.sac,
+        steps=cfg.steps,
+        seed=cfg.seed,
+        folder=run.folder / REPLAY,
+        demonstration=known,
+        relabel=transform if moving else None,
+        scaling=_scaling(scaling, cfg.sac.gamma) if isinstance(scaling, ScalingConfig) else None,
+        termination=termination,
+        absorbing=absorbing,
+    )
+
+
+def _scaling(cfg: ScalingConfig, gamma: float) -> ReturnScaling | None:
+    if not cfg.enabled:
+        return None
+    return ReturnScaling(gamma, reset=cast(ResetRule, cfg.reset), clip=cfg.clip)
+
+
+def _demonstrated(
+    demo: Demonstration,
+    cfg: RunConfig,
+    transform: nn.Module | None,
+    moving: bool,
+    reward: float | None,
+) -> TensorDictBase:
+    """The demonstration's transitions, flat, with the reward to learn from."""
+    if len(demo) > cfg.sac.buffer_size:
+        raise UserError(
+            f"sac.buffer_size={cfg.sac.buffer_size} is less than the demonstration's {len(demo):,} "
+            "transitions: give the buffer more room, or set sac.demonstration=none."
+        )
+    known = demo.transitions.unsqueeze(0).to(cfg.device)
+    if reward is not None:
+        shape = known.get(("next", "done")).shape
+        known = known.set(("next", "reward"), torch.full(shape, reward, device=known.device))
+    elif transform is not None and not moving:
+        # A copy, for rewards of trajectories remember where they are.
+        known = copy.deepcopy(transform).to(cfg.device)(known)
+    return known.squeeze(0)

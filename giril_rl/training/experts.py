@@ -16,15 +16,17 @@ from giril_rl.config.imports import import_modules, modules_of
 from giril_rl.config.schema import ExpertConfig, ExpertRunConfig, RunConfig
 from giril_rl.config.tasks import apply_task_defaults
 from giril_rl.envs import gym_factory, make_env, with_own_episodes
+from giril_rl.envs.families import spaces_of
 from giril_rl.errors import UserError
 from giril_rl.files.disk import missing, remove_empty
-from giril_rl.policies.making import make_agent
+from giril_rl.policies.soft_actor_critic import check_squashable
 from giril_rl.runs.finished import read_result
 from giril_rl.runs.identity import out_folder
 from giril_rl.runs.machine import check_device
 from giril_rl.runs.run import Run
+from giril_rl.training.algorithm import make_algorithm
 from giril_rl.training.loop import train_policy
-from giril_rl.training.ppo import PPO, return_scaling
+from giril_rl.training.ppo import return_scaling
 from giril_rl.training.result import finish_run
 
 
@@ -39,6 +41,8 @@ def check_task(cfg: RunConfig) -> None:
     import_modules(modules_of(cfg), Path.cwd())
     check_device(cfg.device)
     gym_factory(cfg.task)
+    if cfg.algorithm == "sac":
+        check_squashable(spaces_of(cfg.task)[1])
 
 
 def train_expert(cfg: ExpertRunConfig, folder: Path, *, recipe: str = "expert") -> dict[str, Any]:
@@ -59,24 +63,24 @@ def train_expert(cfg: ExpertRunConfig, folder: Path, *, recipe: str = "expert") 
     with Run.open(folder, asdict(cfg), recipe=recipe, logger=cfg.logger) as run:
         if run.finished:
             return read_result(folder)
-        env = run.closing(make_env(cfg.task, cfg.ppo.num_envs, cfg.seed, use="player"))
-        agent = make_agent(env, cfg.ppo, cfg.seed, use="player").to(cfg.device)
+        env = run.closing(make_env(cfg.task, cfg.learner.num_envs, cfg.seed, use="player"))
+        learner = make_algorithm(env, cfg, run=run, use="player")
         trained = train_policy(
             env,
-            PPO(agent, cfg.ppo, steps=cfg.steps),
+            learner,
             _transform(cfg),
             seed=cfg.seed,
             run=run,
             stop_at=cfg.task.expert_score if cfg.stop_early else None,
             use="player",
         )
-        return finish_run(run, cfg, agent, trained)
+        return finish_run(run, cfg, learner.agent, trained)
 
 
 def _transform(cfg: ExpertRunConfig) -> Compose:
     if cfg.clip_reward:
         return Compose(SignTransform([("next", "reward")]))
-    return Compose(*return_scaling(cfg.scaling, cfg.ppo.gamma))
+    return Compose(*return_scaling(cfg))
 
 
 def obtain_expert(cfg: RunConfig, expert: ExpertConfig) -> tuple[Path, dict[str, Any]]:

@@ -20,6 +20,7 @@ from giril_rl.policies.making import check_actions
 from giril_rl.runs.checkpoint import refusing_misfits
 from giril_rl.runs.finite_checks import Finite
 from giril_rl.runs.interrupt import Interrupt, Interrupted
+from giril_rl.runs.metrics import MetricMeans
 from giril_rl.runs.progress import progress
 from giril_rl.runs.randomness import Use, restore_rng, rng_state, stream_seed
 from giril_rl.runs.run import Run
@@ -59,7 +60,7 @@ def train_policy(
     *,
     seed: int,
     run: Run,
-    phase: str = "ppo",
+    phase: str | None = None,
     reward_trainer: RewardTrainer | None = None,
     stop_at: float | None = None,
     use: Use = "training",
@@ -78,7 +79,7 @@ def train_policy(
             ``(num_envs, time)``; its ``state_dict`` is checkpointed.
         seed: seeds action sampling and minibatch order.
         run: where metrics and checkpoints go.
-        phase: name of the checkpoint and of the metrics.
+        phase: name of the checkpoint and of the metrics; None takes the algorithm's.
         reward_trainer: trains the reward model on each batch before ``transform`` uses it.
         stop_at: ends training once the mean true return of the last 20 training episodes reaches
             this. Only an expert, which may see the true reward, is trained with it.
@@ -96,10 +97,12 @@ def train_policy(
         stack.callback(_close, env)
         check_actions(algorithm.agent, env)
         transform.to(algorithm.agent.device)
+        phase = phase or algorithm.name
         session = _Session(algorithm, transform, reward_trainer, run, phase)
         saved = session.begin()
         if saved is not None and session.is_over:
             session.restore(saved)
+            algorithm.close()
             return session.trained
         exact = saved is None or session.restore_simulators(env, saved)
         left = algorithm.steps - session.trained.steps
@@ -139,6 +142,8 @@ def _train(
                 session.save(env)
             if trained.stopped or interrupt.requested:
                 break
+    if session.is_over:
+        algorithm.close()
     if interrupt.requested:  # At the end as well, for the run may have more to do.
         whose = "player" if run.recipe == "expert" else "policy"
         part = f"the {whose}'s training"
@@ -164,6 +169,7 @@ class _Session:
         self.trained.averaged = any(isinstance(part, BatchMeanReward) for part in parts)
         self.tracker = EpisodeTracker(self.algorithm.num_envs)
         self.finite = Finite(self.run.folder, self.algorithm.steps)
+        self.means = MetricMeans()
 
     @property
     def is_over(self) -> bool:
@@ -193,7 +199,7 @@ class _Session:
         except NonFiniteReward as error:
             raise self.finite.error(error.what, step, "data") from error
         losses = self.algorithm.update(batch)
-        self.trained.steps = step
+        before, self.trained.steps = self.trained.steps, step
         metrics = {f"{self.phase}/{name}": value for name, value in losses.items()}
         metrics.update(learned)
         metrics[f"{self.phase}/update_seconds"] = time.perf_counter() - started
@@ -203,7 +209,11 @@ class _Session:
             metrics["train/return_mean"] = returns.mean().item()
             metrics["train/length_mean"] = lengths.double().mean().item()
             self.shown_return = f"{metrics['train/return_mean']:,.1f}"
-        self.run.log(step, metrics, phase=self.phase)
+        episodes = dict.fromkeys(("train/return_mean", "train/length_mean"), float(len(returns)))
+        self.means.add(metrics, totals=["train/episodes"], weights=episodes)
+        every = self.algorithm.log_every
+        if step // every > before // every or self.is_over:
+            self.run.log(step, self.means.take(), phase=self.phase)
         self.finite.losses(losses, step, batch.select(("next", "reward")))
 
     def save(self, env: BatchedEnv) -> None:
@@ -218,6 +228,7 @@ class _Session:
             "stopped": self.trained.stopped,
             "recent": list(self.recent),
             "tracker": dict(self.tracker.state_dict()),
+            "means": self.means.state_dict(),
             "transform": dict(self.transform.state_dict()),
             "algorithm": self.algorithm.state_dict(),
             "reward_trainer": None if trainer is None else trainer.state_dict(),
@@ -240,6 +251,7 @@ class _Session:
         """Puts a checkpoint's tensors back."""
         with refusing_misfits(self.run, self.phase):
             self.tracker.load_state_dict(saved["tracker"])
+            self.means.load_state_dict(saved["means"])
             self.transform.load_state_dict(saved["transform"])
             self.algorithm.load_state_dict(saved["algorithm"])
             if self.reward_trainer is not None:

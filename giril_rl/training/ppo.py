@@ -11,7 +11,7 @@ from torchrl.envs import Transform
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
-from giril_rl.config.schema import PPOConfig, ScalingConfig
+from giril_rl.config.schema import ExpertRunConfig, PPOConfig, RewardRunConfig, ScalingConfig
 from giril_rl.errors import UserError
 from giril_rl.graphs.gradients import TracedGradients
 from giril_rl.policies import ActingPolicy, PPOAgent, collecting
@@ -61,6 +61,10 @@ class PPO:
         ['clip_fraction', 'kl_approx', 'loss_critic', 'loss_objective']
     """
 
+    name = "ppo"
+    own: None = None
+    """PPO keeps no transitions: a reward that learns beside it takes the batch collected last."""
+
     def __init__(
         self, agent: PPOAgent, cfg: PPOConfig, *, steps: int, termination: str = "ends"
     ) -> None:
@@ -68,7 +72,7 @@ class PPO:
             raise UserError(f"termination={termination}: choose one of ends, bootstrap.")
         self.agent, self.cfg = agent, cfg
         self.num_envs, self.checkpoint_every = cfg.num_envs, cfg.checkpoint_every
-        self.frames_per_batch = cfg.num_envs * cfg.rollout
+        self.frames_per_batch = self.log_every = cfg.num_envs * cfg.rollout
         self.steps = cfg.whole_batches(steps)
         self.bootstraps_failure = termination == "bootstrap"
         self._taken = 0
@@ -166,16 +170,32 @@ class PPO:
         self.optimizer.load_state_dict(state["optimizer"])
         self._taken = state["steps"]
 
+    def close(self) -> None:
+        """Nothing: all that PPO keeps is in its checkpoint."""
 
-def return_scaling(cfg: ScalingConfig, gamma: float) -> list[Transform]:
-    """The reward scaling that PPO's settings ask for: a transform, or none.
+
+def return_scaling(
+    cfg: RewardRunConfig | ExpertRunConfig | ScalingConfig, gamma: float | None = None
+) -> list[Transform]:
+    """The reward scaling of a run whose learner is PPO: a transform, or none.
+
+    SAC scales the rewards that it draws from its replay buffer, so that nothing scales them before.
+
+    Args:
+        cfg: the run's settings; or those of the scaling alone, with ``gamma``.
+        gamma: the discount, beside the settings of the scaling alone.
 
     Examples:
         >>> return_scaling(ScalingConfig(enabled=False), gamma=0.99)
         []
+        >>> return_scaling(RewardRunConfig(algorithm="sac"))
+        []
     """
+    if not isinstance(cfg, ScalingConfig):
+        return [] if cfg.algorithm != "ppo" else return_scaling(cfg.scaling, cfg.ppo.gamma)
     if not cfg.enabled:
         return []
+    assert gamma is not None
     return [ReturnScaling(gamma, reset=cast(ResetRule, cfg.reset), clip=cfg.clip)]
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, Protocol
 
 import torch
@@ -50,34 +50,28 @@ class RewardTrainer(Protocol):
         ...
 
 
-class Replay(Protocol):
-    """Where an off-policy learner keeps what its policy did: what the discriminator needs of it."""
-
-    def __len__(self) -> int:
-        """How many transitions of the policy it has."""
-        ...
-
-    def sample(self, size: int) -> TensorDictBase:
-        """``size`` of the policy's transitions, drawn uniformly, ``(size,)``."""
-        ...
+Source = Callable[[int, TensorDictBase], TensorDictBase | None]
+"""``source(count, batch)`` draws ``count`` of the policy's transitions, flat; None where there are
+none yet. ``batch`` is what was collected last and is not stored yet."""
 
 
 class AdversarialTrainer:
     """Trains the discriminator of GAIL, VAIL and AIRL.
 
     On-policy, each batch that was collected gets ``cfg.updates`` gradient steps on pairs drawn from
-    it. Off-policy (``replay``), the policy's pairs are drawn from all that it did, as
+    it. Off-policy (``source``), the policy's pairs are drawn from all that it did, as
     Discriminator-Actor-Critic does (Kostrikov et al. 2019, arXiv 1809.02925), and ``cfg.updates``
-    gradient steps go to each ``cfg.every`` environment steps, whatever a batch's size. Until the
-    replay has ``cfg.batch`` transitions, they come from the batch.
+    gradient steps go to each ``cfg.every`` environment steps, whatever a batch's size. The first
+    batch, before which nothing is stored, is drawn from itself.
 
     Args:
         loss: the discriminator's loss; its reward module is trained in place.
         expert: the expert's transitions, a flat batch with the loss's ``transition_keys``.
         cfg: step size, gradient steps with each batch, and minibatch size.
         seed: seeds minibatches and the loss's noise; the global random state is left alone.
-        replay: the off-policy learner's own transitions; not the demonstration's, which a learner
-            may keep besides. None trains on-policy.
+        source: draws from the off-policy learner's own transitions, as
+            :meth:`~giril_rl.training.sac.SAC.own` does; not from the demonstration's, which a
+            learner may keep besides. None trains on-policy.
         log_prob: ``log_prob(observation, action)``, the present policy's log-probabilities, for a
             loss that reads them, such as AIRL's.
         terminal_rate: failures for each demonstrated transition, see :func:`terminal_rate`; where
@@ -109,13 +103,13 @@ class AdversarialTrainer:
         cfg: DiscriminatorConfig,
         *,
         seed: int,
-        replay: Replay | None = None,
+        source: Source | None = None,
         log_prob: Callable[[Tensor, Tensor], Tensor] | None = None,
         terminal_rate: float = 0.0,
     ) -> None:
         self.loss = loss
         self.cfg = cfg
-        self.replay = replay
+        self.source = source
         self._log_prob = log_prob
         self._keys: list[NestedKey] = loss.transition_keys
         self.gradients = TracedGradients(
@@ -145,7 +139,7 @@ class AdversarialTrainer:
         steps = self._due(len(policy[0]))
         with seeded(0, self._device):
             restore_rng(self._rng)
-            logs = [self._step(policy) for _ in range(steps)]
+            logs = [self._step(part) for part in self._minibatches(batch, policy, steps)]
             self._rng = rng_state(self._device)
         metrics = {
             f"discriminator/{name}": torch.stack([log[name] for log in logs]).mean().item()
@@ -157,18 +151,28 @@ class AdversarialTrainer:
 
     def _due(self, transitions: int) -> int:
         """Gradient steps that follow ``transitions`` more environment steps."""
-        if self.replay is None:
+        if self.source is None:
             return self.cfg.updates
         before = self._taken * self.cfg.updates // self.cfg.every
         self._taken += transitions
         return self._taken * self.cfg.updates // self.cfg.every - before
 
-    def _step(self, batch: list[Tensor]) -> dict[str, Tensor]:
+    def _minibatches(
+        self, batch: TensorDictBase, collected: list[Tensor], steps: int
+    ) -> Iterator[list[Tensor]]:
+        """The policy's part of ``steps`` minibatches."""
+        size, drawn = self.cfg.batch, None
+        if self.source is not None and steps:
+            drawn = self.source(steps * size, batch)
+        if drawn is None:
+            for _ in range(steps):
+                yield _drawn(collected, size)
+            return
+        for part in zip(*(x.split(size) for x in self._columns(drawn)), strict=True):
+            yield list(part)
+
+    def _step(self, policy: list[Tensor]) -> dict[str, Tensor]:
         expert = _drawn(self._expert, self.cfg.batch)
-        if self.replay is not None and len(self.replay) >= self.cfg.batch:
-            policy = self._columns(self.replay.sample(self.cfg.batch))
-        else:
-            policy = _drawn(batch, self.cfg.batch)
         log = self.gradients.step([*self._with_log_prob(expert), *self._with_log_prob(policy)])
         self.optimizer.step()
         self.loss.after_step(log)
@@ -182,6 +186,7 @@ class AdversarialTrainer:
             columns = [column.flatten(0, dims - 1) for column in columns]
         return [column.contiguous().to(self._device) for column in columns]
 
+    @torch.no_grad()
     def _with_log_prob(self, columns: list[Tensor]) -> list[Tensor]:
         if self._log_prob is None:
             return columns
