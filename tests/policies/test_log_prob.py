@@ -10,9 +10,9 @@ from giril_rl.policies import ActorCritic, PixelActorCritic
 
 def agent_of(spec, **kwargs):
     agent = ActorCritic(3, spec, hidden=[8], normalise=False, **kwargs)
-    torch.nn.init.normal_(agent.actor[-1].weight)
+    torch.nn.init.normal_(agent.actor[-1].weight, std=0.3)
     if agent.log_std is not None:
-        torch.nn.init.normal_(agent.log_std)
+        torch.nn.init.normal_(agent.log_std, std=0.3)
     return agent
 
 
