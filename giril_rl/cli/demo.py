@@ -87,6 +87,11 @@ def _import(kinds: Any) -> None:
     parser.add_argument("--out", type=Path, required=True, metavar="FOLDER", help="a new folder")
     parser.add_argument("--episodes", type=int, metavar="N", help="only the first N")
     parser.add_argument("--name", metavar="TEXT", help="what to call the source in the card")
+    parser.add_argument(
+        "--without-actions",
+        action="store_true",
+        help="take states alone, also of a source that has no actions",
+    )
 
 
 def _export(kinds: Any) -> None:
@@ -136,7 +141,13 @@ def _run_import(args: Namespace) -> None:
     from giril_rl.demos.importing import import_demonstration
 
     task = named_task(args.task, args.env_id)
-    found = import_demonstration(args.source, task, episodes=args.episodes, name=args.name)
+    found = import_demonstration(
+        args.source,
+        task,
+        episodes=args.episodes,
+        name=args.name,
+        actions=not args.without_actions,
+    )
     found.save(args.out)
     print(f"{args.out} has {len(found):,} transitions, {found.num_episodes:,} episodes.")
     print(f"replay: {found.card['replay']}")

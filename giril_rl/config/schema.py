@@ -18,6 +18,7 @@ from giril_rl.errors import UserError
 from giril_rl.moved import forwarding
 
 MOST_THREADS = 1024
+USE_ACTIONS = "read actions; false reads states alone, as a demonstration without actions needs"
 COMPILE = "torch.compile of gradient steps: for long training on frames, 20 seconds to begin"
 
 
@@ -225,7 +226,14 @@ class DemoConfig:
     length: int | None = knob(
         1000, "transitions to record; null records `episodes` whole episodes", low=1
     )
-    episodes: int | None = knob(None, "whole episodes to record (then length must be null)", low=1)
+    episodes: int | None = knob(
+        None,
+        "whole episodes to record (then length must be null), or to take of one given by `path`",
+        low=1,
+    )
+    first: int | None = knob(
+        None, "use the first n transitions alone, before `subsample`; null uses all", low=2
+    )
     lives: str = knob(
         "first",
         "Atari: an episode goes up to the first lost life, or through all lives",
@@ -236,18 +244,25 @@ class DemoConfig:
     subsample: int = knob(20, "keep 1 in k transitions, fixed once (paper: 20; 1 keeps all)", low=1)
 
     def check(self, prefix: str, run: object) -> None:
-        """Refuses two lengths, none, or a subsample of nothing."""
+        """Refuses two lengths, none, or more than there will be."""
         length, episodes = default_text(self.length), default_text(self.episodes)
-        if (self.length is None) == (self.episodes is None):
+        if self.path is None and (self.length is None) == (self.episodes is None):
             raise UserError(
                 f"{prefix}length={length} and {prefix}episodes={episodes}: give exactly one of "
                 "them and set the other to null."
             )
-        if self.length is not None and self.subsample > self.length:
+        if self.path is None and self.length is not None and (self.first or 0) > self.length:
             raise UserError(
-                f"{prefix}subsample={self.subsample} leaves nothing of {prefix}length={length}: "
-                "choose a smaller one."
+                f"{prefix}first={self.first} is more than {prefix}length={length}: record more, or "
+                "use fewer."
             )
+        for name in ("first", "length"):
+            most = getattr(self, name)
+            if most is not None and self.subsample > most:
+                raise UserError(
+                    f"{prefix}subsample={self.subsample} leaves nothing of {prefix}{name}={most}: "
+                    "choose a smaller one."
+                )
 
 
 @dataclass
@@ -393,6 +408,36 @@ class DemoRunConfig(RunConfig):
     def needs_demonstration(self) -> bool:
         """Whether the run learns from a demonstration, and so from an expert."""
         return True
+
+    @property
+    def needs_actions(self) -> str | None:
+        """What reads the demonstration's actions, and what to set if it has none; None: nothing."""
+        return self.reward_needs_actions or _replay_needs_actions(self)
+
+    @property
+    def reward_needs_actions(self) -> str | None:
+        """The same of the reward alone, or of the policy where there is no reward."""
+        return needs_actions("reward", getattr(self, "reward", None))
+
+
+def needs_actions(name: str, reward: object) -> str | None:
+    """What of a reward's settings, under the key ``name``, reads actions, and what to set.
+
+    Examples:
+        >>> needs_actions("reward", None)
+        'this recipe learns from: give one that has them, or take another recipe'
+    """
+    uses = getattr(reward, "use_actions", None)
+    if uses is None:
+        return "this recipe learns from: give one that has them, or take another recipe"
+    return f"{name}.use_actions=true reads: set {name}.use_actions=false" if uses else None
+
+
+def _replay_needs_actions(run: object) -> str | None:
+    chosen = getattr(getattr(run, "sac", None), "demonstration", "none")
+    if getattr(run, "algorithm", None) != "sac" or chosen == "none":
+        return None
+    return f"sac.demonstration={chosen} puts into the replay: set sac.demonstration=none"
 
 
 @dataclass

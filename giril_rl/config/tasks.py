@@ -108,6 +108,7 @@ def apply_task_defaults(config: Any, chosen: Collection[str] = ()) -> Any:
 
 def _chooses_demonstration(chosen: Collection[str]) -> bool:
     return any(
-        key.startswith("expert.") or (key.startswith("demo.") and key != "demo.subsample")
+        key.startswith("expert.")
+        or (key.startswith("demo.") and key not in ("demo.subsample", "demo.first"))
         for key in chosen
     )

@@ -9,7 +9,7 @@ from giril_rl.demos.npz import to_npz
 from giril_rl.demos.record import record_demonstration
 from giril_rl.demos.replay import verify_by_replay
 from giril_rl.demos.shipped import shipped_demonstrations
-from giril_rl.demos.subsample import holdout, subsample
+from giril_rl.demos.subsample import holdout, shortened, subsample
 
 __all__ = [
     "Demonstration",
@@ -19,6 +19,7 @@ __all__ = [
     "named_task",
     "record_demonstration",
     "shipped_demonstrations",
+    "shortened",
     "subsample",
     "to_minari",
     "to_npz",

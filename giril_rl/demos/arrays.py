@@ -30,7 +30,12 @@ _CALLED = {
 _NUMBERS = "fiub"  # numpy's kinds: float, signed and unsigned integer, bool
 
 
-def to_transitions(columns: Mapping[str, np.ndarray]) -> TensorDict:
+def needed(names: Sequence[str], *, actions: bool) -> tuple[str, ...]:
+    """``names``, less that of the actions where there need not be any."""
+    return tuple(name for name in names if actions or name not in ("action", "actions"))
+
+
+def to_transitions(columns: Mapping[str, np.ndarray], *, actions: bool = True) -> TensorDict:
     """Transitions as a demonstration stores them, not yet checked for alignment.
 
     Observations, continuous actions and rewards become float32, integer actions int64; images,
@@ -40,6 +45,7 @@ def to_transitions(columns: Mapping[str, np.ndarray]) -> TensorDict:
     Args:
         columns: arrays named as in :data:`NEEDED`, and ``reward``, ``episode`` and ``step`` if
             known; flags and rewards [N] or [N, 1].
+        actions: False leaves the actions out, if there are any.
 
     Raises:
         UserError: for a column that is missing, of another length, or not numeric.
@@ -54,14 +60,17 @@ def to_transitions(columns: Mapping[str, np.ndarray]) -> TensorDict:
         >>> data["episode"].tolist(), data["step"].tolist(), data["next", "reward"].shape
         ([0, 0, 1], [0, 1, 0], torch.Size([3, 1]))
     """
-    check_names(columns, NEEDED, "the data set has no")
+    if not actions:
+        columns = {name: column for name, column in columns.items() if name != "action"}
+    check_names(columns, needed(NEEDED, actions=actions), "the data set has no")
     lengths = {name: len(column) if column.ndim else 0 for name, column in columns.items()}
-    length = lengths["action"]
+    reference = "action" if actions else "observation"
+    length = lengths[reference]
     for name, found in lengths.items():
         if found != length:
             raise UserError(
-                f"the data set has {length} rows of action and {found} of {name}: each needs one "
-                "row per transition."
+                f"the data set has {length} rows of {reference} and {found} of {name}: each needs "
+                "one row per transition."
             )
     if length == 0:
         raise UserError("the data set is empty: at least 2 transitions are needed.")
@@ -84,7 +93,7 @@ def to_transitions(columns: Mapping[str, np.ndarray]) -> TensorDict:
     return TensorDict(
         {
             "observation": _observation("observation", columns["observation"]),
-            "action": _action(columns["action"]),
+            **({"action": _action(columns["action"])} if actions else {}),
             "episode": torch.from_numpy(episode),
             "step": torch.from_numpy(step),
             "next": TensorDict(after, [length]),
@@ -97,8 +106,8 @@ def from_episodes(episodes: Iterable[Mapping[str, np.ndarray]]) -> dict[str, np.
     """Columns for :func:`to_transitions` from episodes with one observation more than actions.
 
     Args:
-        episodes: each with ``observations`` [T + 1, ...], ``actions`` [T, ...], ``terminated`` and
-            ``truncated`` [T], and ``rewards`` [T] in all or none of them.
+        episodes: each with ``observations`` [T + 1, ...], ``terminated`` and ``truncated`` [T],
+            and ``actions`` [T, ...] and ``rewards`` [T] in all or none of them.
 
     Raises:
         UserError: naming the episode whose next states are missing or whose lengths differ.
@@ -114,31 +123,34 @@ def from_episodes(episodes: Iterable[Mapping[str, np.ndarray]]) -> dict[str, np.
     """
     parts: dict[str, list[np.ndarray]] = {}
     for number, episode in enumerate(episodes):
-        observations, actions = episode["observations"], episode["actions"]
-        if actions.ndim == 0 or observations.ndim == 0:
+        observations = episode["observations"]
+        counted = "actions" if "actions" in episode else "terminated"
+        if episode[counted].ndim == 0 or observations.ndim == 0:
             raise UserError(f"episode {number} of the data set has single numbers: it needs rows.")
-        if len(observations) != len(actions) + 1:
+        length = len(episode[counted])
+        if len(observations) != length + 1:
             raise UserError(
                 f"episode {number} of the data set has {len(observations)} observations and "
-                f"{len(actions)} actions, so next states are missing or misaligned: it needs one "
-                "observation more than actions, the last one after the last action."
+                f"{length} {'actions' if counted == 'actions' else 'steps'}, so next states are "
+                "missing or misaligned: it needs one observation more than actions, the last one "
+                "after the last action."
             )
         rows = {
             "observation": observations[:-1],
-            "action": actions,
             "next_observation": observations[1:],
             "terminated": episode["terminated"],
             "truncated": episode["truncated"],
             # Not counted from the flags, which are checked against these.
-            "episode": np.full(len(actions), number, np.int64),
-            "step": np.arange(len(actions), dtype=np.int64),
+            "episode": np.full(length, number, np.int64),
+            "step": np.arange(length, dtype=np.int64),
         }
-        if "rewards" in episode:
-            rows["reward"] = episode["rewards"]
+        for theirs, ours in (("actions", "action"), ("rewards", "reward")):
+            if theirs in episode:
+                rows[ours] = episode[theirs]
         for name, row in rows.items():
-            if row.ndim == 0 or len(row) != len(actions):
+            if row.ndim == 0 or len(row) != length:
                 raise UserError(
-                    f"episode {number} of the data set has {len(actions)} actions and "
+                    f"episode {number} of the data set has {length} {counted} and "
                     f"{len(row) if row.ndim else 'no'} rows of {name}: each needs as many."
                 )
             parts.setdefault(name, []).append(row)
@@ -264,4 +276,6 @@ def check_names(found: Collection[str], needed: Sequence[str], begin: str) -> No
     if others:
         pairs = " and ".join(f"{ours!r} by {name!r}" for ours, name in others.items())
         raise UserError(f"{sentence}; did you mean {pairs}?")
+    if missing in (["action"], ["actions"]):
+        raise UserError(f"{sentence}; --without-actions takes states alone.")
     raise UserError(f"{sentence}.")

@@ -49,13 +49,30 @@ def check_demonstration(
     demo.check()
     if observation_dim is not None:
         _check_shape(list(demo.transitions["observation"].shape[1:]), observation_dim)
-    if action_spec is not None:
+    if action_spec is not None and demo.has_actions:
         _check_actions(demo.transitions["action"], action_spec)
 
 
 def check_for_task(demo: Demonstration, task: TaskConfig) -> None:
     """:func:`check_demonstration` with the spaces of ``task``."""
     check_demonstration(demo, *spaces_of(task))
+
+
+def check_whole_episode(demo: Demonstration, what: str) -> None:
+    """Refuses a demonstration that is one cut episode.
+
+    Args:
+        demo: the demonstration, as much of it as is used.
+        what: what needs a whole episode, for the message.
+
+    Raises:
+        UserError: if no episode has an end.
+    """
+    if not demo.transitions["next", "done"].any():
+        raise fault(
+            f"has no whole episode and {what} needs one: its {len(demo):,} transitions are the "
+            "beginning of one. Use more of it (demo.first), or a longer one (demo.length)."
+        )
 
 
 def check_environment(demo: Demonstration, task: TaskConfig) -> None:
@@ -70,7 +87,8 @@ def check_environment(demo: Demonstration, task: TaskConfig) -> None:
     recorded = demo.card.get("env_id")
     if isinstance(recorded, str) and _unversioned(recorded) != _unversioned(task.env_id):
         raise UserError(
-            f"the demonstration is of {recorded} and not of {task.env_id}: use one of this task."
+            f"the demonstration is of {recorded} and not of {task.env_id}: use one of this task, "
+            "or, if the two are one environment, take env_id out of its card.json."
         )
 
 

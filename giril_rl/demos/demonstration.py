@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 import shutil
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -41,12 +42,13 @@ class Demonstration:
     Args:
         transitions: flat TensorDict, batch [N]: ``observation`` float32 [N, d], before any
             normalisation, or images, uint8 [N, c, h, w]; ``action``, as executed, float32 [N, a] or
-            int64 [N]; ``("next", "observation")``, at an episode's end the true terminal
+            int64 [N], or none; ``("next", "observation")``, at an episode's end the true terminal
             observation; ``("next", "reward" | "done" | "terminated" | "truncated")`` [N, 1];
             ``episode`` and ``step`` int64 [N], both counted from 0.
         card: plain JSON values. ``length`` is the fixed number of transitions, which may cut the
             last episode, or None if all episodes are whole; ``seeds`` has one reset seed per
-            episode. :func:`giril_rl.demos.record_demonstration` lists the others.
+            episode; ``actions`` is False if there are none. The others are listed by
+            :func:`giril_rl.demos.record_demonstration`.
 
     Examples:
         >>> import gymnasium
@@ -73,6 +75,11 @@ class Demonstration:
         return self.transitions["observation"].dtype == torch.uint8
 
     @property
+    def has_actions(self) -> bool:
+        """Whether it has actions, rather than states alone."""
+        return self.card.get("actions") is not False
+
+    @property
     def has_rewards(self) -> bool:
         """Whether the true rewards are known; unknown ones are stored as zeros."""
         return self.card.get("rewards") is not False
@@ -88,6 +95,21 @@ class Demonstration:
         rewards = self.transitions["next", "reward"].reshape(-1).double()
         sums = torch.zeros(self.num_episodes, dtype=torch.float64)
         return sums.index_add(0, self.transitions["episode"], rewards)
+
+    def mean_return(self, episodes: int | None = None) -> float:
+        """Mean true return of the first ``episodes`` episodes, of all by default.
+
+        A cut one counts only where there is no other. Of a part of a demonstration it is the mean
+        of the whole episodes that the part was taken from.
+        """
+        taken = self.card.get("taken_from")
+        mean = taken.get("return_mean") if isinstance(taken, dict) else None
+        if episodes is None and isinstance(mean, float) and math.isfinite(mean):
+            return mean
+        returns = self.returns
+        if not self.transitions["next", "done"][-1] and len(returns) > 1:
+            returns = returns[:-1]
+        return returns[:episodes].mean().item()
 
     @property
     def lengths(self) -> Tensor:
@@ -118,7 +140,22 @@ class Demonstration:
         Raises:
             UserError: naming the first fault found and where it is.
         """
-        check_transitions(self.transitions, may_cut_last=self.card.get("length") is not None)
+        check_transitions(
+            self.transitions,
+            may_cut_last=self.card.get("length") is not None,
+            actions=self.has_actions,
+        )
+
+    def without_actions(self) -> Demonstration:
+        """The same states alone; the card says so.
+
+        Examples:
+            >>> data = TensorDict({"action": torch.zeros(3), "step": torch.arange(3)}, [3])
+            >>> states = Demonstration(data).without_actions()
+            >>> list(states.transitions.keys()), states.has_actions
+            (['step'], False)
+        """
+        return Demonstration(self.transitions.exclude("action"), {**self.card, "actions": False})
 
     def save(self, folder: Path | str) -> None:
         """Writes ``folder`` atomically: a TensorDict memmap, ``card.json``, and images' frames.

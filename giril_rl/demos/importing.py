@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from giril_rl.config.schema import TaskConfig
-from giril_rl.demos.arrays import check_names, to_transitions
+from giril_rl.demos.arrays import check_names, needed, to_transitions
 from giril_rl.demos.check import check_for_task
 from giril_rl.demos.demonstration import Demonstration
 from giril_rl.demos.minari import read_minari
@@ -26,7 +26,12 @@ _NEEDED = ("observation", "action", "next.observation", "next.terminated", "next
 
 
 def import_demonstration(
-    source: str, task: TaskConfig, *, episodes: int | None = None, name: str | None = None
+    source: str,
+    task: TaskConfig,
+    *,
+    episodes: int | None = None,
+    name: str | None = None,
+    actions: bool = True,
 ) -> Demonstration:
     """Reads a data set and checks it against a task; :meth:`Demonstration.save` then writes it.
 
@@ -42,6 +47,7 @@ def import_demonstration(
         task: the demonstrated task.
         episodes: number of episodes to take, from the first; None takes all.
         name: what the card calls the source; its file's name if None.
+        actions: False takes states alone, whether or not the data set has actions.
 
     Raises:
         UserError: if the data set has a fault or does not fit the task.
@@ -65,19 +71,19 @@ def import_demonstration(
     try:
         if source.startswith(MINARI):
             kind, own = "minari", source.removeprefix(MINARI)
-            columns, untrusted = read_minari(own, episodes)
+            columns, untrusted = read_minari(own, episodes, actions=actions)
         elif path.is_dir():
             kind, own = "memmap", path.resolve().name
-            columns, untrusted = _read_memmap(path), {}
+            columns, untrusted = _read_memmap(path, actions), {}
         elif path.suffix == ".npz":
             kind, own = "npz", path.name
-            columns, untrusted = read_npz(path)
+            columns, untrusted = read_npz(path, actions=actions)
         else:
             raise UserError(
                 f"{source} is neither minari:NAME, nor an .npz file, nor a folder of a TensorDict: "
                 "name one of these."
             )
-        demo = Demonstration(to_transitions(columns))
+        demo = Demonstration(to_transitions(columns, actions=actions))
     except MemoryError:
         raise UserError(f"{source} does not fit into memory: take fewer episodes.") from None
     if episodes is not None:
@@ -96,13 +102,15 @@ def import_demonstration(
         "rewards": rewards,
         "source": {"format": kind, "name": _printable(name or own)},
     }
+    if not actions:
+        demo.card["actions"] = False
     check_for_task(demo, task)
     demo.card["episode_returns"] = demo.returns.tolist() if rewards else None
     demo.card["replay"] = _replayed(demo, task)
     return demo
 
 
-def _read_memmap(folder: Path) -> dict[str, np.ndarray]:
+def _read_memmap(folder: Path, actions: bool) -> dict[str, np.ndarray]:
     if (folder / "card.json").is_file():
         raise UserError(f"{folder} is a demonstration already: demo.path={folder} takes it.")
     if any(path.is_symlink() for path in folder.rglob("*")):
@@ -118,7 +126,7 @@ def _read_memmap(folder: Path) -> dict[str, np.ndarray]:
     names = [
         key if isinstance(key, str) else ".".join(key) for key in data.keys(True, leaves_only=True)
     ]
-    check_names(names, _NEEDED, f"{folder} has no")
+    check_names(names, needed(_NEEDED, actions=actions), f"{folder} has no")
     after = data["next"]
     found = {name: data.get(name, None) for name in ("observation", "action", "episode", "step")}
     found |= {name: after.get(name, None) for name in ("reward", "terminated", "truncated")}
@@ -167,6 +175,8 @@ def _printable(text: str) -> str:
 
 
 def _replayed(demo: Demonstration, task: TaskConfig) -> str:
+    if not demo.has_actions:
+        return "none: no actions"
     if not demo.card["seeds"]:
         return "none: no seeds"
     if not demo.has_rewards:

@@ -96,7 +96,7 @@ def to_minari(
 
     Raises:
         UserError: if Minari is not installed or refuses the name, or the demonstration has a
-            fault.
+            fault or no actions.
         OSError: ENOSPC if there is not room for it.
 
     Examples:
@@ -112,6 +112,10 @@ def to_minari(
             'a Minari export needs the package minari: pip install "giril-rl[minari]".'
         ) from None
     check_name(dataset_id)
+    if not demo.has_actions:
+        raise UserError(
+            "a Minari dataset has actions and this demonstration has none: export it with --npz."
+        )
     demo.check()
     # To others the cut is a truncation; our import undoes it.
     card = demo.card if demo.transitions["next", "done"][-1] else {**demo.card, "last_cut": True}
@@ -240,12 +244,15 @@ def _publish(temporary: Path, root: Path, dataset_id: str) -> None:
     (temporary / dataset_id).replace(root / dataset_id)
 
 
-def read_minari(name: str, episodes: int | None = None) -> tuple[dict[str, Any], dict[str, Any]]:
+def read_minari(
+    name: str, episodes: int | None = None, *, actions: bool = True
+) -> tuple[dict[str, Any], dict[str, Any]]:
     """Columns for :func:`~giril_rl.demos.arrays.to_transitions`, and a card of untrusted values.
 
     Args:
         name: the dataset's id.
         episodes: number of episodes to read, from the first; None reads all.
+        actions: whether to read the actions; those that are not read may be of any kind.
 
     Raises:
         UserError: if h5py is missing, or the dataset is missing, damaged or of another kind.
@@ -269,7 +276,7 @@ def read_minari(name: str, episodes: int | None = None) -> tuple[dict[str, Any],
         if metadata.get("data_format", "hdf5") != "hdf5" or not path.is_file():
             raise _Fault("has no main_data.hdf5: only its HDF5 format can be read")
         with h5py.File(path, "r") as file:
-            return _read(file, metadata, episodes)
+            return _read(file, metadata, episodes, actions)
     except UserError:
         raise
     except _Fault as fault:
@@ -296,7 +303,7 @@ def _metadata(path: Path) -> dict[str, Any]:
 
 
 def _read(
-    file: Any, metadata: dict[str, Any], episodes: int | None
+    file: Any, metadata: dict[str, Any], episodes: int | None, actions: bool
 ) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     held, said = len(file), metadata.get("total_episodes")
     if said != held:
@@ -306,9 +313,10 @@ def _read(
     if not held:
         raise _Fault("is empty: at least 2 transitions are needed")
     found, seeds = [], []
+    wanted = {ours: theirs for ours, theirs in _ARRAYS.items() if actions or ours != "actions"}
     for number in range(held if episodes is None else min(held, episodes)):
         group = _entry(file, f"episode_{number}")
-        found.append({ours: _array(group, theirs) for ours, theirs in _ARRAYS.items()})
+        found.append({ours: _array(group, theirs) for ours, theirs in wanted.items()})
         seeds.append(group.attrs.get("seed"))
     card = parse_card(metadata.get("description"))  # Most descriptions are prose.
     if card.get("last_cut") is True and len(found) == held:

@@ -11,7 +11,14 @@ from typing import Any
 import numpy as np
 
 from giril_rl.config.nearest import did_you_mean
-from giril_rl.demos.arrays import NEEDED, check_names, from_episodes, parse_card, renamed
+from giril_rl.demos.arrays import (
+    NEEDED,
+    check_names,
+    from_episodes,
+    needed,
+    parse_card,
+    renamed,
+)
 from giril_rl.demos.demonstration import Demonstration
 from giril_rl.demos.storage import BROKEN, MOST_PACKED, npy_header
 from giril_rl.errors import UserError
@@ -22,7 +29,7 @@ EPISODES = ("observations", "actions", "lengths", "terminated")
 _KNOWN = {*NEEDED, "reward", *EPISODES, "rewards", "card"}
 
 
-def read_npz(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+def read_npz(path: Path, *, actions: bool = True) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Columns for :func:`~giril_rl.demos.arrays.to_transitions`, and a card of untrusted values.
 
     Nothing is unpickled, and nothing is read before its size is known. The file has one of two
@@ -33,6 +40,8 @@ def read_npz(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     - Whole episodes, concatenated: ``observations`` [N + E, ...], T + 1 rows for an episode of T
       actions, ``actions`` [N, ...], ``lengths`` int [E], ``terminated`` bool [E] (the other
       episodes ended at a time limit), ``rewards`` [N] if known.
+
+    With ``actions=False`` there may be no actions.
 
     Raises:
         UserError: for a file that is damaged, or holds anything else.
@@ -49,7 +58,7 @@ def read_npz(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         raise UserError(f"there is no file {path}: name an .npz file.")
     try:
         with zipfile.ZipFile(path) as archive:
-            names = _names(archive)
+            names = _names(archive, actions)
             check_memory(path.name, sum(member.file_size for member in archive.infolist()))
             arrays = {name: _array(archive, name) for name in names}
     except BROKEN as error:
@@ -64,7 +73,7 @@ def to_npz(demo: Demonstration, path: Path | str) -> None:
     """Writes a demonstration, one row per transition; an import gives the same bits back.
 
     Args:
-        demo: what to export; unknown rewards are left out.
+        demo: what to export; unknown rewards, and actions that it has not, are left out.
         path: a new file, ending in ``.npz``.
 
     Raises:
@@ -84,11 +93,12 @@ def to_npz(demo: Demonstration, path: Path | str) -> None:
     after = demo.transitions["next"]
     columns = {
         "observation": demo.transitions["observation"],
-        "action": demo.transitions["action"],
         "next_observation": after["observation"],
         "terminated": after["terminated"].reshape(-1),
         "truncated": after["truncated"].reshape(-1),
     }
+    if demo.has_actions:
+        columns["action"] = demo.transitions["action"]
     if demo.has_rewards:
         columns["reward"] = after["reward"].reshape(-1)
     arrays = {name: column.cpu().numpy() for name, column in columns.items()}
@@ -105,7 +115,7 @@ def to_npz(demo: Demonstration, path: Path | str) -> None:
         raise
 
 
-def _names(archive: zipfile.ZipFile) -> list[str]:
+def _names(archive: zipfile.ZipFile, actions: bool) -> list[str]:
     files = [member.filename for member in archive.infolist()]
     names = [file.removesuffix(".npy") for file in files]
     for file, name in zip(files, names, strict=True):
@@ -113,11 +123,11 @@ def _names(archive: zipfile.ZipFile) -> list[str]:
             raise UserError(f"the .npz file holds {file!r} twice: write it anew.")
         if file == name:
             raise UserError(f"{file!r} in the .npz file is not an array: leave it out.")
-    _check_names(names)
+    _check_names(names, actions)
     return names
 
 
-def _check_names(names: list[str]) -> None:
+def _check_names(names: list[str], actions: bool) -> None:
     """Refuses names of neither form, and a form that is not complete."""
 
     def likeness(form: tuple[str, ...]) -> tuple[int, int]:
@@ -125,8 +135,12 @@ def _check_names(names: list[str]) -> None:
         return same + len(renamed(names, form)), same
 
     whole = "lengths" in names
-    needed = EPISODES if whole else max(NEEDED, EPISODES, key=likeness)
-    check_names(names, needed, f"the .npz file has {'lengths and ' if whole else ''}no")
+    form = EPISODES if whole else max(NEEDED, EPISODES, key=likeness)
+    check_names(
+        names,
+        needed(form, actions=actions),
+        f"the .npz file has {'lengths and ' if whole else ''}no",
+    )
     for name in names:
         if name not in _KNOWN:
             hint = did_you_mean(name, _KNOWN) or "; leave it out."
@@ -158,7 +172,7 @@ def _whole(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
             "transitions: leave one out."
         )
     lengths, ended = arrays["lengths"], arrays["terminated"]
-    observations, actions = arrays["observations"], arrays["actions"]
+    observations = arrays["observations"]
     if (
         lengths.ndim != 1
         or lengths.dtype.kind not in "iu"
@@ -172,13 +186,12 @@ def _whole(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
             "the episode ended by itself."
         )
     total, count = sum(lengths.tolist()), len(lengths)
-    rows = {
-        "actions": (actions, total),
-        "observations": (observations, total + count),
-        "rewards": (arrays.get("rewards", actions), total),
+    rows: dict[str, np.ndarray] = {
+        name: arrays[name] for name in ("actions", "rewards") if name in arrays
     }
-    for name, (array, wanted) in rows.items():
-        found = len(array) if array.ndim else 0
+    wanted_rows = {"observations": total + count, **dict.fromkeys(rows, total)}
+    for name, wanted in wanted_rows.items():
+        found = len(arrays[name]) if arrays[name].ndim else 0
         if found != wanted:
             raise UserError(
                 f"the .npz file has {found} rows of {name} and lengths ask for {wanted} "
@@ -189,14 +202,9 @@ def _whole(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     for number, length in enumerate(lengths.tolist()):
         part = slice(start, start + length)
         last = np.arange(length) == length - 1
-        episodes.append(
-            {
-                "observations": observations[start + number : start + number + length + 1],
-                "actions": actions[part],
-                "terminated": last & ended[number],
-                "truncated": last & ~ended[number],
-                **({"rewards": arrays["rewards"][part]} if "rewards" in arrays else {}),
-            }
-        )
+        episode = {name: array[part] for name, array in rows.items()}
+        episode["observations"] = observations[start + number : start + number + length + 1]
+        episode["terminated"], episode["truncated"] = last & ended[number], last & ~ended[number]
+        episodes.append(episode)
         start += length
     return from_episodes(episodes)

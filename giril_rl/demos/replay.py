@@ -44,7 +44,8 @@ def verify_by_replay(
             bits, which a deterministic simulator gives on the same machine.
 
     Raises:
-        UserError: at the first transition that differs, or whose action does not exist.
+        UserError: at the first transition that differs, or whose action does not exist; without
+            seeds or actions.
 
     Examples:
         >>> from giril_rl.demos import record_demonstration
@@ -59,6 +60,8 @@ def verify_by_replay(
         ...
         giril_rl.errors.UserError: replaying the demonstration's actions leads elsewhere ...
     """
+    if not demo.has_actions:
+        raise UserError("the demonstration has no actions, so there is nothing to replay.")
     seeds = demo.card.get("seeds", [])
     if len(seeds) != demo.num_episodes:
         raise UserError(

@@ -79,6 +79,8 @@ def _numbers(count: int) -> str:
 
 
 def _actions(demo: Demonstration) -> str:
+    if not demo.has_actions:
+        return "none, states alone"
     action, names = demo.transitions["action"], demo.card.get("actions")
     if action.ndim > 1:
         return f"{_numbers(action.shape[1])} from {action.min():.2f} to {action.max():.2f}"

@@ -25,17 +25,18 @@ _KEYS: list[NestedKey] = [
 ]
 
 
-def check_transitions(data: TensorDict, *, may_cut_last: bool) -> None:
+def check_transitions(data: TensorDict, *, may_cut_last: bool, actions: bool = True) -> None:
     """Refuses transitions with a fault that would teach something wrong.
 
     Args:
         data: as :class:`~giril_rl.demos.Demonstration` describes; not changed.
         may_cut_last: whether the last episode may stop without an end.
+        actions: whether there are actions, or states alone.
 
     Raises:
         UserError: naming the first fault found and where it is.
     """
-    _check_tensors(data)
+    _check_tensors(data, _KEYS if actions else [key for key in _KEYS if key != "action"])
     _check_episodes(data, may_cut_last=may_cut_last)
 
 
@@ -54,9 +55,11 @@ def _name(key: NestedKey) -> str:
     return key if isinstance(key, str) else ".".join(map(str, key))
 
 
-def _check_tensors(data: TensorDict) -> None:
+def _check_tensors(data: TensorDict, keys: list[NestedKey]) -> None:
     found = set(data.keys(include_nested=True, leaves_only=True))
-    for key in _KEYS:
+    if "action" in found and "action" not in keys:
+        raise fault("has actions and a card that says that it has none: mend the card.")
+    for key in keys:
         if key not in found:
             raise fault(f"has no {_name(key)!r}: record it with giril_rl.")
     if data.ndim != 1 or data.shape[0] == 0:
@@ -65,7 +68,7 @@ def _check_tensors(data: TensorDict) -> None:
         )
     if data.shape[0] == 1:
         raise fault("has only one transition: at least 2 are needed.")
-    for key in _KEYS:
+    for key in keys:
         _check_tensor(_name(key), data.get(key), data.shape[0])
     if data["observation"].shape != data["next", "observation"].shape:
         raise fault("has observations and next observations of different shapes: record it anew.")

@@ -1,4 +1,4 @@
-"""Training and validation parts of a demonstration."""
+"""How much of a demonstration is used, and its training and validation parts."""
 
 from __future__ import annotations
 
@@ -7,6 +7,68 @@ from tensordict import TensorDict
 
 from giril_rl.demos.demonstration import Demonstration
 from giril_rl.errors import UserError
+
+
+def shortened(
+    demo: Demonstration, *, episodes: int | None = None, first: int | None = None
+) -> Demonstration:
+    """The first whole episodes of a demonstration, or its first transitions.
+
+    The card's ``taken_from`` then says how many ``transitions`` there were, and the mean return of
+    the whole episodes that they are taken from, None where rewards are not known.
+
+    Args:
+        demo: the demonstration; not changed.
+        episodes: how many whole episodes; None takes all there is.
+        first: how many transitions, of those episodes; None takes all. It may cut an episode.
+
+    Raises:
+        UserError: if there are fewer.
+
+    Examples:
+        >>> import gymnasium
+        >>> from giril_rl.demos import record_demonstration
+        >>> demo = record_demonstration(
+        ...     lambda: gymnasium.make("CartPole-v1"), lambda o: o.new_ones(1).long(),
+        ...     episodes=3, seed=0,
+        ... )
+        >>> part = shortened(demo, episodes=2, first=12)
+        >>> demo.lengths.tolist(), part.lengths.tolist()
+        ([10, 8, 9], [10, 2])
+        >>> part.card["taken_from"]
+        {'transitions': 27, 'return_mean': 9.0}
+    """
+    if episodes is None and first is None:
+        return demo
+    part, card = demo.transitions, dict(demo.card)
+    whole = demo.num_episodes - (not demo.transitions["next", "done"][-1])
+    if episodes is not None:
+        if episodes > whole:
+            raise UserError(
+                f"demo.episodes={episodes}: the demonstration has {whole} whole episodes: give at "
+                "most that, or null for all of it."
+            )
+        part, card["length"] = part[part["episode"] < episodes], None
+    if first is not None:
+        if first > len(part):
+            raise UserError(
+                f"demo.first={first}: the demonstration has {len(part):,} transitions"
+                f"{f' in {episodes} episodes' if episodes is not None else ''}: give at most that, "
+                "or null for all of them."
+            )
+        part, card["length"] = part[:first], first
+    taken = Demonstration(part.clone(), card)
+    card |= {
+        "transitions": len(taken),
+        "taken_from": {
+            "transitions": len(demo),
+            "return_mean": demo.mean_return(episodes) if demo.has_rewards else None,
+        },
+    }
+    for name in ("seeds", "episode_returns", "lives_left"):
+        if isinstance(card.get(name), list):
+            card[name] = card[name][: taken.num_episodes]
+    return taken
 
 
 def subsample(demo: Demonstration, every: int, offset: int = 0) -> TensorDict:

@@ -10,7 +10,7 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 
-from giril_rl.config.schema import AveragedRunConfig, FitConfig, knob
+from giril_rl.config.schema import AveragedRunConfig, FitConfig, knob, needs_actions
 from giril_rl.demos import Demonstration, holdout, subsample
 from giril_rl.envs import BatchedEnv
 from giril_rl.rewards import CuriosityConfig, GenerativeConfig
@@ -58,6 +58,15 @@ class ControlRunConfig(AveragedRunConfig):
     def needs_demonstration(self) -> bool:
         """Whether the control is made of a demonstration, and so of an expert."""
         return self.method.demonstration
+
+    @property
+    def reward_needs_actions(self) -> str | None:
+        """What of the control reads the demonstration's actions; the copy reads none."""
+        for part in ("giril", "icm"):
+            settings = getattr(self, part)
+            if type(settings) is self.method.settings and self.reward != "copy":
+                return needs_actions(part, settings)
+        return None
 
     @property
     def trains(self) -> bool:

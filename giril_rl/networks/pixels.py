@@ -225,7 +225,7 @@ class PixelPairNetwork(nn.Module):
         frames = flat_frames(observation, self.channels)
         weight = self.first.weight
         kernel_sums = weight[:, self.channels :].sum((-2, -1))
-        planes = encoding.reshape(-1, encoding.shape[-1]) @ kernel_sums.T
+        planes = encoding.reshape(len(frames), encoding.shape[-1]) @ kernel_sums.T
         out = F.conv2d(frames, weight[:, : self.channels], self.first.bias, stride=2)
         out = self.head(self.rest(out + planes[..., None, None]))
         return out.reshape(*observation.shape[:-3], *out.shape[1:])

@@ -8,7 +8,7 @@ import torch
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.data import Categorical, OneHot, TensorSpec
-from torchrl.modules import MLP, NormalParamExtractor, ProbabilisticActor, TanhNormal
+from torchrl.modules import MLP, ProbabilisticActor, TanhNormal
 from torchrl.modules.distributions import OneHotCategorical
 
 from giril_rl.errors import UserError
@@ -73,7 +73,7 @@ class SACAgent(Agent):
         head: list[nn.Module] = []
         outputs = self.action_size
         if not self.discrete:
-            head = [_FixedScale(noise) if noise is not None else NormalParamExtractor()]
+            head = [_Scale() if noise is None else _FixedScale(noise)]
             outputs *= 1 if noise is not None else 2
         self.actor = nn.Sequential(self._mlp(observation_size, outputs), *head)
 
@@ -173,6 +173,14 @@ class SACAgent(Agent):
             return index
         zeros = torch.zeros(*index.shape, self.action_size, dtype=torch.int64, device=index.device)
         return zeros.scatter(-1, index.unsqueeze(-1), 1)
+
+
+class _Scale(nn.Module):
+    """Mean and standard deviation, the latter between e^-20 and e^2 as is usual for SAC."""
+
+    def forward(self, outputs: Tensor) -> tuple[Tensor, Tensor]:
+        location, log_scale = outputs.chunk(2, -1)
+        return location, log_scale.clamp(-20, 2).exp()
 
 
 class _FixedScale(nn.Module):

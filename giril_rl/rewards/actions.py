@@ -17,10 +17,12 @@ class ActionEncoder(nn.Module):
     - Box ``(*batch, size)``: clamped to the bounds, as the simulator does before it acts, then
       mapped affinely from the bounds to [-1, 1]. A dimension without two finite bounds keeps its
       unit.
+    - With ``use_actions=False``: nothing, a vector of size 0, so that a network reads states alone.
 
     Args:
         spec: TorchRL's action spec, with or without the environment's batch dimensions, or a
             Composite of nothing else.
+        use_actions: False encodes empty actions ``(*batch, 0)``, see :meth:`nothing`, as they are.
 
     Raises:
         UserError: for an unsupported spec, or actions that do not fit it. Only dtype and shape are
@@ -32,6 +34,9 @@ class ActionEncoder(nn.Module):
         [[0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]
         >>> ActionEncoder(Bounded(0.0, 4.0, shape=(1,)))(torch.tensor([[3.0], [9.0]])).tolist()
         [[0.5], [1.0]]
+        >>> states = ActionEncoder(Categorical(3), use_actions=False)
+        >>> states(states.nothing(torch.zeros(7, 2))).shape
+        torch.Size([7, 0])
     """
 
     low: Tensor
@@ -39,11 +44,15 @@ class ActionEncoder(nn.Module):
     offset: Tensor
     scale: Tensor
 
-    def __init__(self, spec: TensorSpec) -> None:
+    def __init__(self, spec: TensorSpec, *, use_actions: bool = True) -> None:
         super().__init__()
         spec = single_action_spec(spec)
-        self.discrete = isinstance(spec, (Categorical, OneHot))
-        self.one_hot = isinstance(spec, OneHot)
+        self.use_actions = use_actions
+        self.discrete = use_actions and isinstance(spec, (Categorical, OneHot))
+        self.one_hot = use_actions and isinstance(spec, OneHot)
+        if not use_actions:
+            self.size = 0
+            return
         self.size = int(spec.space.n if self.discrete else spec.shape[-1])
         if self.discrete:
             return
@@ -55,6 +64,8 @@ class ActionEncoder(nn.Module):
     @property
     def kind(self) -> str:
         """What the actions are, in a word or two."""
+        if not self.use_actions:
+            return "empty actions"
         if self.one_hot:
             return "one-hot vectors"
         return "integers" if self.discrete else "vectors"
@@ -63,6 +74,11 @@ class ActionEncoder(nn.Module):
     def event(self) -> tuple[int, ...]:
         """The shape of one action."""
         return () if self.discrete and not self.one_hot else (self.size,)
+
+    def nothing(self, observation: Tensor, event_dims: int = 1) -> Tensor:
+        """Empty actions ``(*batch, 0)`` for observations of ``event_dims`` dimensions each."""
+        batch = observation.shape[: observation.ndim - event_dims]
+        return torch.empty(*batch, 0, device=observation.device)
 
     def batch(self, action: Tensor) -> torch.Size:
         """The leading shape of actions.
@@ -121,6 +137,8 @@ class ActionEncoder(nn.Module):
     def forward(self, action: Tensor) -> Tensor:
         """The encoded actions ``(*batch, size)``."""
         self.batch(action)
+        if not self.use_actions:
+            return action
         if self.one_hot:
             return action.to(torch.get_default_dtype())
         if self.discrete:
@@ -140,4 +158,5 @@ class ActionEncoder(nn.Module):
 
     def extra_repr(self) -> str:
         """Shows kind and size when printed."""
-        return f"{'discrete' if self.discrete else 'box'}, size={self.size}"
+        kind = "discrete" if self.discrete else "box" if self.use_actions else "unused"
+        return f"{kind}, size={self.size}"

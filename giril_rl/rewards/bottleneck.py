@@ -86,6 +86,7 @@ class BottleneckReward(DiscriminatorReward):
         normalise: DiscriminatorScaling = "standardise",
         clamp: float | None = 10.0,
         absorbing: bool = False,
+        use_actions: bool = True,
         seed: int = 0,
         in_keys: Sequence[NestedKey] = PAIR_KEYS,
         out_keys: Sequence[NestedKey] = REWARD_KEYS,
@@ -96,7 +97,7 @@ class BottleneckReward(DiscriminatorReward):
         Arguments are those of :meth:`DiscriminatorReward.for_vectors`, and ``latent``, the size
         of z.
         """
-        actions = ActionEncoder(action_spec)
+        actions = ActionEncoder(action_spec, use_actions=use_actions)
         with seeded(seed):
             encoder = mlp(observation_dim + actions.size + absorbing, 2 * latent, hidden)
             head = nn.Linear(latent, 1)
@@ -120,13 +121,14 @@ class BottleneckReward(DiscriminatorReward):
         channels: int = 4,
         form: RewardForm = "positive",
         absorbing: bool = False,
+        use_actions: bool = True,
         seed: int = 0,
         in_keys: Sequence[NestedKey] = PAIR_KEYS,
         out_keys: Sequence[NestedKey] = REWARD_KEYS,
         latent: int = 8,
     ) -> BottleneckReward:
         """The paper's encoder for ``channels`` frames of 84x84; see `for_vectors`."""
-        actions = ActionEncoder(action_spec)
+        actions = ActionEncoder(action_spec, use_actions=use_actions)
         with seeded(seed):
             encoder = PixelBottleneck(actions.size + absorbing, latent, channels)
             head = nn.Linear(latent, 1)
@@ -249,7 +251,7 @@ def bottleneck_reward(
 ) -> BottleneckReward:
     """VAIL's reward; arguments as :func:`~giril_rl.rewards.discriminator_reward` has them."""
     settings = replace(settings, absorbing=bool(settings.absorbing))
-    shared, own = "form absorbing latent", "hidden normalise clamp"
+    shared, own = "form absorbing use_actions latent", "hidden normalise clamp"
     reward = reward_for(env, BottleneckReward, settings, seed=seed, of_all=shared, of_vectors=own)
     reward.fit_scaler(pairs.get("observation"))
     return reward

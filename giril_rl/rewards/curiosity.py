@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from torchrl.data import TensorSpec
 from torchrl.envs import EnvBase
 
-from giril_rl.config.schema import knob
+from giril_rl.config.schema import USE_ACTIONS, knob
 from giril_rl.errors import UserError
 from giril_rl.networks.pixels import ForwardModel, InverseModel, PixelFeatures
 from giril_rl.networks.vectors import mlp
@@ -31,6 +31,7 @@ from giril_rl.rewards.transitions import (
     TransitionReward,
     check_output,
     check_transitions,
+    reads_actions,
     reward_for,
 )
 from giril_rl.runs.pretrained import Pretrained, remembered
@@ -59,7 +60,21 @@ class CuriosityConfig:
     model_hidden: list[int] = knob(
         [100], "hidden layers of inverse and forward model (tanh)", low=1
     )
+    use_actions: bool = knob(True, USE_ACTIONS)
     seed: int | None = knob(None, "seed of the reward model; null takes the run's seed", low=0)
+
+    def check(self, prefix: str, run: object) -> None:
+        """Refuses trained features without actions."""
+        check_features(prefix, self.features, use_actions=self.use_actions)
+
+
+def check_features(prefix: str, features: str, *, use_actions: bool) -> None:
+    """Refuses features that would be trained to predict actions where none are read."""
+    if not use_actions and features != "none":
+        raise UserError(
+            f"{prefix}use_actions=false leaves the inverse model, which trains the features, "
+            f"nothing to predict: set {prefix}features=none, which keeps them random."
+        )
 
 
 def feature_error(predicted: Tensor, features: Tensor) -> Tensor:
@@ -82,6 +97,9 @@ def feature_error(predicted: Tensor, features: Tensor) -> Tensor:
 class CuriosityReward(Pretrained, TransitionReward):
     """ICM: ``r = lambda * ||forward(phi(s), a) - phi(s')||^2``, the error in feature space.
 
+    With ``use_actions=False`` there is no inverse model, and the forward model predicts ``phi(s')``
+    from ``phi(s)`` alone, of random features.
+
     Features are those of scaled observations. The inverse model, which predicts the action from
     ``phi(s)`` and ``phi(s')``, trains the features; the reward does not use it. The reward is
     deterministic.
@@ -93,7 +111,7 @@ class CuriosityReward(Pretrained, TransitionReward):
     Args:
         features: phi, maps a scaled observation to its features.
         inverse_model: called with ``phi(s)`` and ``phi(s')``, predicts the action: its logits if it
-            is discrete, else its encoding.
+            is discrete, else its encoding. None where actions are not read.
         forward_model: called with ``phi(s)`` and the encoded action, predicts ``phi(s')``.
         scaler: applied to both observations.
         actions: encodes actions.
@@ -118,7 +136,7 @@ class CuriosityReward(Pretrained, TransitionReward):
     def __init__(
         self,
         features: nn.Module,
-        inverse_model: nn.Module,
+        inverse_model: nn.Module | None,
         forward_model: nn.Module,
         *,
         scaler: ObservationScaler | PixelScaler,
@@ -128,12 +146,11 @@ class CuriosityReward(Pretrained, TransitionReward):
         out_keys: Sequence[NestedKey] = REWARD_KEYS,
     ) -> None:
         roles = "observation", "action", "next observation"
-        super().__init__("a curiosity reward", roles, in_keys, out_keys)
+        super().__init__("a curiosity reward", roles, in_keys, out_keys, actions=actions)
         self.features = features
         self.inverse_model = inverse_model
         self.forward_model = forward_model
         self.scaler = scaler
-        self.actions = actions
         self.scale = scale
 
     @classmethod
@@ -148,6 +165,7 @@ class CuriosityReward(Pretrained, TransitionReward):
         scale: float = 1.0,
         normalise: ScalingRule = "standardise",
         clamp: bool = True,
+        use_actions: bool = True,
         seed: int = 0,
         in_keys: Sequence[NestedKey] = TRANSITION_KEYS,
         out_keys: Sequence[NestedKey] = REWARD_KEYS,
@@ -163,6 +181,7 @@ class CuriosityReward(Pretrained, TransitionReward):
             scale: lambda.
             normalise: the scaler's rule.
             clamp: clamp the scaled observations to [-1, 1].
+            use_actions: False reads observations alone, see :class:`ActionEncoder`.
             seed: seed of the weights. The global random state stays as it is.
             in_keys: see the class.
             out_keys: see the class.
@@ -170,13 +189,13 @@ class CuriosityReward(Pretrained, TransitionReward):
         Raises:
             UserError: for an unknown rule or kind of action.
         """
-        actions = ActionEncoder(action_spec)
+        actions = ActionEncoder(action_spec, use_actions=use_actions)
         size = hidden[-1] if hidden else observation_dim
         with seeded(seed):
             features: nn.Module = nn.Identity()
             if hidden:
                 features = nn.Sequential(*mlp(observation_dim, size, hidden[:-1]), nn.Tanh())
-            inverse_model = mlp(2 * size, actions.size, model_hidden)
+            inverse_model = mlp(2 * size, actions.size, model_hidden) if use_actions else None
             forward_model = mlp(size + actions.size, size, model_hidden)
         return cls(
             features,
@@ -197,6 +216,7 @@ class CuriosityReward(Pretrained, TransitionReward):
         *,
         channels: int = 4,
         scale: float = 1.0,
+        use_actions: bool = True,
         seed: int = 0,
         in_keys: Sequence[NestedKey] = TRANSITION_KEYS,
         out_keys: Sequence[NestedKey] = REWARD_KEYS,
@@ -206,10 +226,11 @@ class CuriosityReward(Pretrained, TransitionReward):
         In training mode batch normalisation makes a reward depend on its batch.
         :class:`~giril_rl.transforms.IntrinsicReward` calls the module in eval mode.
         """
-        actions = ActionEncoder(action_spec)
+        actions = ActionEncoder(action_spec, use_actions=use_actions)
         with seeded(seed):
             features = PixelFeatures(channels)
-            inverse_model, forward_model = InverseModel(actions.size), ForwardModel(actions.size)
+            inverse_model = InverseModel(actions.size) if use_actions else None
+            forward_model = ForwardModel(actions.size)
         return cls(
             features,
             inverse_model,
@@ -223,6 +244,7 @@ class CuriosityReward(Pretrained, TransitionReward):
 
     def invert(self, features: Tensor, next_features: Tensor) -> Tensor:
         """``a_hat``: logits of a discrete action, the encoding of a continuous one."""
+        assert self.inverse_model is not None
         return self.inverse_model(features, next_features)
 
     def predict(self, features: Tensor, encoding: Tensor) -> Tensor:
@@ -259,6 +281,9 @@ class CuriosityRewardLoss(TransitionLoss):
       ``L_F`` then shrinks the features, since small ones are easily predicted.
     - ``"none"``: phi keeps its random weights, as in the authors' released code.
 
+    Of a reward that reads no actions there is ``loss_forward`` only, and ``"none"`` is all that it
+    allows: ``L_F`` alone would make all features the same.
+
     Args:
         reward: the module to train; its parameters are this loss's parameters.
         features: what trains phi.
@@ -266,7 +291,7 @@ class CuriosityRewardLoss(TransitionLoss):
         functional: see :class:`~giril_rl.rewards.TransitionLoss`.
 
     Raises:
-        UserError: for an unknown ``features`` or ``reduction``.
+        UserError: for an unknown ``features`` or ``reduction``, or one that needs actions.
 
     Examples:
         >>> import torch
@@ -293,23 +318,26 @@ class CuriosityRewardLoss(TransitionLoss):
         super().__init__(reward, reduction=reduction, functional=functional)
         if features not in get_args(FeatureTraining):
             raise UserError(f"features={features!r} is unknown: choose inverse, both or none.")
+        check_features("", features, use_actions=reads_actions(reward))
         self.features: FeatureTraining = features
 
     @property
     def out_keys(self) -> list[NestedKey]:
-        """Names of the two terms."""
-        return ["loss_inverse", "loss_forward"]
+        """Names of the two terms, or of the one that needs no actions."""
+        return ["loss_inverse", "loss_forward"][not reads_actions(self.reward) :]
 
     def terms(
         self, observation: Tensor, action: Tensor, next_observation: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """The two terms; ``features`` decides which of them train phi."""
+    ) -> tuple[Tensor, ...]:
+        """The terms; ``features`` decides which of them train phi."""
         reward = self.reward
         check_transitions(reward.scaler, reward.actions, observation, action, next_observation)
         phi = reward.features(reward.scaler(observation))
         next_phi = reward.features(reward.scaler(next_observation))
         if self.features == "none":
             phi, next_phi = phi.detach(), next_phi.detach()
+        if not reads_actions(reward):
+            return (reward.forward_error(phi, action, next_phi),)
         inverse = action_term(reward.invert(phi, next_phi), reward.actions.target(action))
         if self.features == "inverse":
             phi, next_phi = phi.detach(), next_phi.detach()
@@ -335,8 +363,8 @@ def curiosity_reward(
         >>> curiosity_reward(CuriosityConfig(), GymEnv("CartPole-v1"), pairs, seed=0).scaler
         ObservationScaler(4, rule='standardise', clamp=True)
     """
-    own = "hidden model_hidden normalise clamp"
-    reward = reward_for(env, CuriosityReward, settings, seed=seed, of_all="scale", of_vectors=own)
+    every, own = "scale use_actions", "hidden model_hidden normalise clamp"
+    reward = reward_for(env, CuriosityReward, settings, seed=seed, of_all=every, of_vectors=own)
     reward.scaler.fit(pairs.get("observation"))
     return reward
 

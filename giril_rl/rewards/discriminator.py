@@ -21,7 +21,7 @@ from torch import Tensor, nn
 from torchrl.data import TensorSpec
 from torchrl.envs import EnvBase
 
-from giril_rl.config.schema import COMPILE, knob
+from giril_rl.config.schema import COMPILE, USE_ACTIONS, knob
 from giril_rl.errors import UserError
 from giril_rl.networks.normalise import RunningNormaliser, running_statistics
 from giril_rl.networks.pixels import SIDE, PixelDiscriminator
@@ -47,6 +47,7 @@ from giril_rl.rewards.transitions import (
     check_output,
     read,
     reward_for,
+    with_action,
 )
 from giril_rl.runs.pretrained import Pretrained, remembered
 from giril_rl.runs.randomness import seeded
@@ -87,6 +88,7 @@ class AdversarialConfig(DiscriminatorConfig):
         "reward of D = P(expert): positive -log(1-D), negative log D, log_ratio, reversed -log D",
         choices=("positive", "negative", "log_ratio", "reversed"),
     )
+    use_actions: bool = knob(True, USE_ACTIONS)
     absorbing: bool | None = knob(
         None, "a failure leads to an absorbing state, which is rewarded too; null: off-policy only"
     )
@@ -162,10 +164,10 @@ class DiscriminatorReward(Pretrained, TransitionReward):
         out_keys: Sequence[NestedKey] = REWARD_KEYS,
     ) -> None:
         adversarial_reward(torch.zeros(1), form)  # Refuses an unknown form before it is needed.
-        super().__init__("a discriminator's reward", ("observation", "action"), in_keys, out_keys)
+        roles = "observation", "action"
+        super().__init__("a discriminator's reward", roles, in_keys, out_keys, actions=actions)
         self.network = network
         self.scaler = scaler
-        self.actions = actions
         self.form: RewardForm = form
         self.absorbing = None if absorbing is None else tuple(absorbing)
 
@@ -181,6 +183,7 @@ class DiscriminatorReward(Pretrained, TransitionReward):
         normalise: DiscriminatorScaling = "standardise",
         clamp: float | None = 10.0,
         absorbing: bool = False,
+        use_actions: bool = True,
         seed: int = 0,
         in_keys: Sequence[NestedKey] = PAIR_KEYS,
         out_keys: Sequence[NestedKey] = REWARD_KEYS,
@@ -195,6 +198,7 @@ class DiscriminatorReward(Pretrained, TransitionReward):
             normalise: the observation's rule, see :func:`discriminator_scaler`.
             clamp: bound on each scaled observation; None has none.
             absorbing: whether absorbing states are judged too.
+            use_actions: False reads observations alone, see :class:`ActionEncoder`.
             seed: seed of the weights. The global random state stays as it is.
             in_keys: see the class.
             out_keys: see the class.
@@ -202,7 +206,7 @@ class DiscriminatorReward(Pretrained, TransitionReward):
         Raises:
             UserError: for an unknown form, rule or kind of action.
         """
-        actions = ActionEncoder(action_spec)
+        actions = ActionEncoder(action_spec, use_actions=use_actions)
         with seeded(seed):
             network = mlp(observation_dim + actions.size + absorbing, 1, hidden)
         return cls(
@@ -224,12 +228,13 @@ class DiscriminatorReward(Pretrained, TransitionReward):
         channels: int = 4,
         form: RewardForm = "positive",
         absorbing: bool = False,
+        use_actions: bool = True,
         seed: int = 0,
         in_keys: Sequence[NestedKey] = PAIR_KEYS,
         out_keys: Sequence[NestedKey] = REWARD_KEYS,
     ) -> DiscriminatorReward:
         """The paper's network for ``channels`` frames of 84x84; see `for_vectors`."""
-        actions = ActionEncoder(action_spec)
+        actions = ActionEncoder(action_spec, use_actions=use_actions)
         with seeded(seed):
             network = PixelDiscriminator(actions.size + absorbing, channels=channels)
         return cls(
@@ -461,22 +466,21 @@ class DiscriminatorLoss(AdversarialLoss):
         self, reward: DiscriminatorReward, *, penalty: float = 0.0, functional: bool = False
     ) -> None:
         super().__init__(reward, penalty=penalty, functional=functional)
-        observation, action = (k if isinstance(k, tuple) else (k,) for k in reward.in_keys)
-        self.set_keys(
-            expert_observation=("expert", *observation),
-            expert_action=("expert", *action),
-            policy_observation=("policy", *observation),
-            policy_action=("policy", *action),
-        )
+        entries = dict(zip(("observation", "action"), reward.in_keys, strict=False))
+        if reward.absorbing is not None:
+            entries["terminated"] = TERMINATED
+        keys = {
+            f"{side}_{entry}": (side, *(key if isinstance(key, tuple) else (key,)))
+            for side in ("expert", "policy")
+            for entry, key in entries.items()
+        }
+        self._entries = list(keys)
+        self.set_keys(**keys)
 
     @property
     def in_keys(self) -> list[NestedKey]:
         """Keys of the expert's set, then of the policy's: observation, action, perhaps the end."""
-        keys = self.tensor_keys
-        expert = [keys.expert_observation, keys.expert_action, keys.expert_terminated]
-        policy = [keys.policy_observation, keys.policy_action, keys.policy_terminated]
-        read = len(self.transition_keys)
-        return [*expert[:read], *policy[:read]]
+        return [getattr(self.tensor_keys, entry) for entry in self._entries]
 
     @property
     def transition_keys(self) -> list[NestedKey]:
@@ -487,13 +491,16 @@ class DiscriminatorLoss(AdversarialLoss):
     def _terms(self, tensordict: TensorDictBase) -> TensorDictBase:
         entries = read(tensordict, self.in_keys)
         half = len(entries) // 2
-        expert = _flat("expert", *self.reward.inputs(*entries[:2]))
-        policy = _flat("policy", *self.reward.inputs(*entries[half : half + 2]))
+        read_of = len(self.reward.in_keys)
+        expert, policy = (
+            _flat(name, *self.reward.inputs(*with_action(self.reward, pairs[:read_of])))
+            for name, pairs in (("expert", entries[:half]), ("policy", entries[half:]))
+        )
         sets = Sets(len(expert[0]), len(policy[0]))
         parts = [expert, policy]
         if self.reward.absorbing is not None:
             parts.append(self.reward.absorbing_inputs())
-            rates = (entries[2].float().mean(), entries[half + 2].float().mean())
+            rates = (entries[half - 1].float().mean(), entries[-1].float().mean())
             sets = sets._replace(rates=rates)
         # One pass for both sets.
         observation, encoding = (torch.cat(rows) for rows in zip(*parts, strict=True))
@@ -564,7 +571,7 @@ def _flat(name: str, observation: Tensor, encoding: Tensor) -> tuple[Tensor, Ten
     dims = encoding.ndim - 1
     if dims != 1:
         observation = observation.reshape(-1, *observation.shape[dims:])
-        encoding = encoding.reshape(-1, encoding.shape[-1])
+        encoding = encoding.reshape(encoding.shape[:-1].numel(), encoding.shape[-1])
     if not len(encoding):
         raise UserError(f"the {name}'s set has no pairs: give at least one.")
     return observation, encoding
@@ -582,7 +589,7 @@ def discriminator_reward(
         seed: seed of the weights. The global random state stays as it is.
     """
     settings = replace(settings, absorbing=bool(settings.absorbing))
-    shared, own = "form absorbing", "hidden normalise clamp"
+    shared, own = "form absorbing use_actions", "hidden normalise clamp"
     reward = reward_for(
         env, DiscriminatorReward, settings, seed=seed, of_all=shared, of_vectors=own
     )

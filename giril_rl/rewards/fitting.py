@@ -17,7 +17,7 @@ from torchrl.objectives import LossModule
 
 from giril_rl.errors import UserError
 from giril_rl.rewards.scaler import check_finite
-from giril_rl.rewards.transitions import check_transitions, read
+from giril_rl.rewards.transitions import check_transitions, read, reads_actions, with_action
 from giril_rl.runs.randomness import seeded
 
 Reduction = Literal["mean", "sum", "none"]
@@ -102,12 +102,15 @@ class TransitionLoss(RewardLoss):
             raise UserError(f"reduction={reduction!r} is unknown: choose mean, sum or none.")
         super().__init__(reward, functional=functional)
         self.reduction = reduction
-        self._entries = ("observation", "action", "next_observation")[: len(reward.in_keys)]
+        entries = ["observation", "action", "next_observation"]
+        if not reads_actions(reward):
+            entries.remove("action")
+        self._entries = entries[: len(reward.in_keys)]
         self.set_keys(**dict(zip(self._entries, reward.in_keys, strict=True)))
 
     @property
     def in_keys(self) -> list[NestedKey]:
-        """Keys of observation, action and, if the reward reads it, next observation."""
+        """Keys of what the reward reads of observation, action and next observation."""
         return [getattr(self.tensor_keys, entry) for entry in self._entries]
 
     @property
@@ -120,14 +123,15 @@ class TransitionLoss(RewardLoss):
         """The terms in the order of their names, each of the batch's shape.
 
         A subclass takes what the reward reads: ``observation`` ``(*batch, d)``, as the environment
-        gives it, ``action``, as the environment takes it, and perhaps ``next_observation``.
+        gives it, ``action``, as the environment takes it (empty with ``use_actions=False``), and
+        perhaps ``next_observation``.
         """
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """The terms, reduced; with ``reduction="none"`` of the batch's shape."""
         with self.parameters_in_reward():
-            terms = self.terms(*read(tensordict, self.in_keys))
+            terms = self.terms(*with_action(self.reward, read(tensordict, self.in_keys)))
         reduced = {
             name: self._reduce_loss(term, tensordict=tensordict)
             for name, term in zip(self.out_keys, terms, strict=True)
@@ -207,7 +211,8 @@ def fit(
 
 def _check(loss: TransitionLoss, demonstration: TensorDictBase) -> None:
     """Checks the whole demonstration once, so that minibatches need no checks of values."""
-    entries = observation, action, *_ = read(demonstration, loss.in_keys)
+    entries = read(demonstration, loss.in_keys)
+    observation, action, *_ = filled = with_action(loss.reward, entries)
     scaler, actions = loss.reward.scaler, loss.reward.actions
     batch = observation.shape[: observation.ndim - scaler.event_dims]
     if batch != demonstration.batch_size:
@@ -215,7 +220,7 @@ def _check(loss: TransitionLoss, demonstration: TensorDictBase) -> None:
             f"the demonstration's batch_size is {list(demonstration.batch_size)} where its "
             f"observations have {list(batch)}: give TensorDict(..., batch_size={list(batch)})."
         )
-    check_transitions(scaler, actions, *entries)
+    check_transitions(scaler, actions, *filled)
     for key, entry in zip(loss.in_keys, entries, strict=True):
         check_finite(str(key), entry)
     actions.check_values(action)

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from torchrl.data import TensorSpec
 from torchrl.envs import EnvBase
 
-from giril_rl.config.schema import knob
+from giril_rl.config.schema import USE_ACTIONS, knob
 from giril_rl.errors import UserError
 from giril_rl.networks.pixel_decoder import PixelDecoder
 from giril_rl.networks.pixels import PixelEncoder, PixelPrior
@@ -41,6 +41,7 @@ from giril_rl.rewards.transitions import (
     TransitionReward,
     check_output,
     check_transitions,
+    reads_actions,
     reward_for,
 )
 from giril_rl.runs.pretrained import Pretrained, remembered
@@ -76,7 +77,18 @@ class GenerativeConfig:
     )
     clamp: bool = knob(True, "clamp observations to [-1, 1], those of normalise=raw too")
     hidden: list[int] = knob([100, 100], "hidden layers of encoder and decoder (tanh)", low=1)
+    use_actions: bool = knob(True, USE_ACTIONS)
     seed: int | None = knob(None, "seed of the reward model; null takes the run's seed", low=0)
+
+    def check(self, prefix: str, run: object) -> None:
+        """Refuses weights of an action that is not read."""
+        for name, unset in (("beta", 1.0), ("alpha", None)):
+            value = getattr(self, name)
+            if not self.use_actions and value != unset:
+                raise UserError(
+                    f"{prefix}{name}={value} is a weight of the action, which "
+                    f"{prefix}use_actions=false leaves out: leave {prefix}{name} out."
+                )
 
 
 def reconstruction_error(predicted: Tensor, target: Tensor, dims: int = 1) -> Tensor:
@@ -161,6 +173,10 @@ class GenerativeReward(Pretrained, TransitionReward):
     With ``beta<1`` the noise comes from the module's own generator, whose state is saved with the
     module. A batch and the same transitions step by step then agree in distribution only.
 
+    With ``use_actions=False`` z is a latent of the transition that no action supervises, and takes
+    ``a_hat``'s place: the limit ``beta -> 0`` of eq. 2, after eq. 1 without its third term. Beta
+    has no effect, and the noise is drawn as with ``beta<1``.
+
     Reads observation ``(*batch, d)`` or, of uint8, ``(*batch, channels, 84, 84)``, action and next
     observation. Writes one reward per transition, ``(*batch, 1)``. Train it with
     :class:`~giril_rl.rewards.GenerativeRewardLoss`, after ``reward.scaler.fit(observations)``.
@@ -210,12 +226,11 @@ class GenerativeReward(Pretrained, TransitionReward):
         if not 0 < beta <= 1:
             raise UserError(f"beta={beta} is outside (0, 1]: give a value such as 1.0.")
         roles = "observation", "action", "next observation"
-        super().__init__("a generative reward", roles, in_keys, out_keys)
+        super().__init__("a generative reward", roles, in_keys, out_keys, actions=actions)
         self.encoder = encoder
         self.decoder = decoder
         self.prior_network = prior_network
         self.scaler = scaler
-        self.actions = actions
         self.beta = beta
         self.scale = scale
         self._generator = torch.Generator().manual_seed(seed)
@@ -234,6 +249,7 @@ class GenerativeReward(Pretrained, TransitionReward):
         prior: Prior = "standard",
         normalise: ScalingRule = "standardise",
         clamp: bool = True,
+        use_actions: bool = True,
         seed: int = 0,
         in_keys: Sequence[NestedKey] = TRANSITION_KEYS,
         out_keys: Sequence[NestedKey] = REWARD_KEYS,
@@ -250,6 +266,7 @@ class GenerativeReward(Pretrained, TransitionReward):
                 for the p(z | s) of eq. 1.
             normalise: the scaler's rule.
             clamp: compare states clamped to [-1, 1].
+            use_actions: False reads observations alone, see the class.
             seed: seed of weights and noise. The global random state stays as it is.
             in_keys: see the class.
             out_keys: see the class.
@@ -257,8 +274,8 @@ class GenerativeReward(Pretrained, TransitionReward):
         Raises:
             UserError: for a beta outside (0, 1], or an unknown prior, rule or kind of action.
         """
-        conditional, actions = _is_conditional(prior), ActionEncoder(action_spec)
-        d, k = observation_dim, actions.size
+        conditional = _is_conditional(prior)
+        d, k = observation_dim, ActionEncoder(action_spec).size
         with seeded(seed):
             encoder, decoder = mlp(2 * d, 2 * k, hidden), mlp(k + d, d, hidden)
             prior_network = mlp(d, 2 * k, hidden) if conditional else None
@@ -266,7 +283,7 @@ class GenerativeReward(Pretrained, TransitionReward):
             encoder,
             decoder,
             scaler=ObservationScaler(d, rule=normalise, clamp=clamp),
-            actions=actions,
+            actions=ActionEncoder(action_spec, use_actions=use_actions),
             prior_network=prior_network,
             beta=beta,
             scale=scale,
@@ -286,21 +303,21 @@ class GenerativeReward(Pretrained, TransitionReward):
         scale: float = 1.0,
         prior: Prior = "standard",
         clamp: bool = True,
+        use_actions: bool = True,
         seed: int = 0,
         in_keys: Sequence[NestedKey] = TRANSITION_KEYS,
         out_keys: Sequence[NestedKey] = REWARD_KEYS,
     ) -> GenerativeReward:
         """The paper's networks for ``channels`` frames of 84x84 (Table 2); see `for_vectors`."""
-        conditional, actions = _is_conditional(prior), ActionEncoder(action_spec)
+        conditional, k = _is_conditional(prior), ActionEncoder(action_spec).size
         with seeded(seed):
-            encoder = PixelEncoder(actions.size, channels)
-            decoder = PixelDecoder(actions.size, channels)
-            prior_network = PixelPrior(actions.size, channels) if conditional else None
+            encoder, decoder = PixelEncoder(k, channels), PixelDecoder(k, channels)
+            prior_network = PixelPrior(k, channels) if conditional else None
         return cls(
             encoder,
             decoder,
             scaler=PixelScaler(clamp=clamp),
-            actions=actions,
+            actions=ActionEncoder(action_spec, use_actions=use_actions),
             prior_network=prior_network,
             beta=beta,
             scale=scale,
@@ -380,12 +397,14 @@ class GenerativeReward(Pretrained, TransitionReward):
 
     def _blended(self, s: Tensor, action: Tensor, s_next: Tensor) -> Tensor:
         encoding = self.actions(action)
-        if self.beta == 1:
+        if self.beta == 1 and self.actions.use_actions:
             return encoding
         mu, logvar = self.encode(s, s_next)
         # Drawn on the CPU, so that a seed means the same on every device.
         noise = torch.randn(mu.shape, generator=self._generator, dtype=mu.dtype).to(mu.device)
         z = mu + (0.5 * logvar).exp() * noise
+        if not self.actions.use_actions:
+            return z
         return blend_action(encoding, z.softmax(-1) if self.actions.discrete else z, self.beta)
 
     def get_extra_state(self) -> Tensor:
@@ -454,24 +473,23 @@ class GenerativeRewardLoss(TransitionLoss):
 
     @property
     def out_keys(self) -> list[NestedKey]:
-        """Names of the three terms."""
-        return ["loss_reconstruction", "loss_kl", "loss_action"]
+        """Names of the three terms, the last where actions are read."""
+        return ["loss_reconstruction", "loss_kl", "loss_action"][: 2 + reads_actions(self.reward)]
 
     def terms(
         self, observation: Tensor, action: Tensor, next_observation: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """The three terms, for one sample of z."""
+    ) -> tuple[Tensor, ...]:
+        """The terms, for one sample of z."""
         reward = self.reward
         check_transitions(reward.scaler, reward.actions, observation, action, next_observation)
         s, s_next = reward.scaler(observation), reward.scaler(next_observation)
         mu, logvar = reward.encode(s, s_next)
         z = mu + (0.5 * logvar).exp() * torch.randn_like(mu)
         error = reconstruction_error(reward.decode(z, s), s_next, reward.scaler.event_dims)
-        return (
-            reward.scale * error,
-            gaussian_kl(mu, logvar, *reward.prior(s)),
-            self.alpha * action_term(z, reward.actions.target(action)),
-        )
+        terms = reward.scale * error, gaussian_kl(mu, logvar, *reward.prior(s))
+        if not reads_actions(reward):
+            return terms
+        return *terms, self.alpha * action_term(z, reward.actions.target(action))
 
 
 def generative_reward(
@@ -492,7 +510,7 @@ def generative_reward(
         >>> generative_reward(GenerativeConfig(), GymEnv("CartPole-v1"), pairs, seed=0).scaler
         ObservationScaler(4, rule='standardise', clamp=True)
     """
-    every = "beta scale prior clamp"
+    every = "beta scale prior clamp use_actions"
     reward = reward_for(
         env, GenerativeReward, settings, seed=seed, of_all=every, of_vectors="hidden normalise"
     )

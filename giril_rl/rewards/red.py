@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from torchrl.data import TensorSpec
 from torchrl.envs import EnvBase
 
-from giril_rl.config.schema import knob
+from giril_rl.config.schema import USE_ACTIONS, knob
 from giril_rl.errors import UserError
 from giril_rl.networks.pixels import FEATURES, PixelFeatures
 from giril_rl.networks.vectors import mlp
@@ -33,6 +33,7 @@ from giril_rl.rewards.transitions import (
     check_transitions,
     per_transition,
     reward_for,
+    with_action,
 )
 from giril_rl.runs.pretrained import Pretrained, remembered
 from giril_rl.runs.randomness import seeded
@@ -61,6 +62,7 @@ class DistillationConfig:
     clamp: bool = knob(True, "clamp observations to [-1, 1], those of normalise=raw too")
     hidden: list[int] = knob([100, 100], "hidden layers of both networks (tanh)", low=1)
     features: int = knob(100, "size of both networks' output", low=1)
+    use_actions: bool = knob(True, USE_ACTIONS)
     seed: int | None = knob(None, "seed of the reward model; null takes the run's seed", low=0)
 
 
@@ -131,11 +133,11 @@ class DistillationReward(Pretrained, TransitionReward):
         in_keys: Sequence[NestedKey] = PAIR_KEYS,
         out_keys: Sequence[NestedKey] = REWARD_KEYS,
     ) -> None:
-        super().__init__("a distillation reward", ("observation", "action"), in_keys, out_keys)
+        roles = "observation", "action"
+        super().__init__("a distillation reward", roles, in_keys, out_keys, actions=actions)
         self.predictor = predictor
         self.target = target.requires_grad_(False)
         self.scaler = scaler
-        self.actions = actions
         self.register_buffer("sigma", torch.tensor(float(sigma)))
 
     @classmethod
@@ -150,6 +152,7 @@ class DistillationReward(Pretrained, TransitionReward):
         sigma: float = 1.0,
         normalise: ScalingRule = "standardise",
         clamp: bool = True,
+        use_actions: bool = True,
         seed: int = 0,
         in_keys: Sequence[NestedKey] = PAIR_KEYS,
         out_keys: Sequence[NestedKey] = REWARD_KEYS,
@@ -164,6 +167,7 @@ class DistillationReward(Pretrained, TransitionReward):
             sigma: sharpness.
             normalise: the scaler's rule.
             clamp: clamp the scaled observations to [-1, 1].
+            use_actions: False reads observations alone, see :class:`ActionEncoder`.
             seed: seed of the weights. The global random state stays as it is.
             in_keys: see the class.
             out_keys: see the class.
@@ -171,7 +175,7 @@ class DistillationReward(Pretrained, TransitionReward):
         Raises:
             UserError: for an unknown rule or kind of action.
         """
-        actions = ActionEncoder(action_spec)
+        actions = ActionEncoder(action_spec, use_actions=use_actions)
         with seeded(seed):
             predictor = mlp(observation_dim + actions.size, features, hidden)
             target = mlp(observation_dim + actions.size, features, hidden)
@@ -194,12 +198,13 @@ class DistillationReward(Pretrained, TransitionReward):
         channels: int = 4,
         features: int = 100,
         sigma: float = 1.0,
+        use_actions: bool = True,
         seed: int = 0,
         in_keys: Sequence[NestedKey] = PAIR_KEYS,
         out_keys: Sequence[NestedKey] = REWARD_KEYS,
     ) -> DistillationReward:
         """ICM's convolutions and a linear layer for ``channels`` frames; see `for_vectors`."""
-        actions = ActionEncoder(action_spec)
+        actions = ActionEncoder(action_spec, use_actions=use_actions)
         with seeded(seed):
             predictor = _PixelNetwork(channels, actions.size, features)
             target = _PixelNetwork(channels, actions.size, features)
@@ -248,10 +253,10 @@ class DistillationReward(Pretrained, TransitionReward):
         if not 0 < demo_reward < 1:
             raise UserError(f"demo_reward={demo_reward} is outside (0, 1): give one such as 0.9.")
         device = self.sigma.device
-        entries = [pairs.get(key).to(device) for key in self.in_keys]
+        entries = with_action(self, tuple(pairs.get(key).to(device) for key in self.in_keys))
         error = per_transition(
             lambda *pair: distillation_error(*self.outputs(*pair)),
-            tuple(entries),
+            entries,
             self.scaler.event_dims,
         ).double()
 
@@ -328,7 +333,7 @@ def red_reward(
         ObservationScaler(4, rule='standardise', clamp=True)
     """
     settings = replace(settings, sigma=settings.sigma or 1.0)  # Until it is calibrated.
-    shared, own = "features sigma", "hidden normalise clamp"
+    shared, own = "features sigma use_actions", "hidden normalise clamp"
     reward = reward_for(env, DistillationReward, settings, seed=seed, of_all=shared, of_vectors=own)
     reward.scaler.fit(pairs.get("observation"))
     return reward

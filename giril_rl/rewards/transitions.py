@@ -36,6 +36,8 @@ class TransitionReward(TensorDictModuleBase):
         roles: what the ``in_keys`` stand for, in order.
         in_keys: the keys to read.
         out_keys: the key to write, one.
+        actions: encodes actions, if it reads any. With ``use_actions=False`` the action's key is
+            left out of ``in_keys``, and :meth:`value` gets an empty action.
 
     Raises:
         UserError: for another number of keys.
@@ -64,6 +66,8 @@ class TransitionReward(TensorDictModuleBase):
         roles: Sequence[str],
         in_keys: Sequence[NestedKey],
         out_keys: Sequence[NestedKey],
+        *,
+        actions: ActionEncoder | None = None,
     ) -> None:
         super().__init__()
         if len(in_keys) != len(roles) or len(out_keys) != 1:
@@ -74,11 +78,15 @@ class TransitionReward(TensorDictModuleBase):
             )
         self.in_keys: list[NestedKey] = list(in_keys)
         self.out_keys: list[NestedKey] = list(out_keys)
+        if actions is not None:
+            self.actions = actions
+            if not actions.use_actions:
+                del self.in_keys[roles.index("action")]
 
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Writes each transition's reward."""
-        transitions = read(tensordict, self.in_keys)
+        transitions = with_action(self, read(tensordict, self.in_keys))
         self.check(*transitions)
         return tensordict.set(self.out_keys[0], self.values(*transitions).unsqueeze(-1))
 
@@ -103,6 +111,20 @@ def read(tensordict: TensorDictBase, keys: Sequence[NestedKey]) -> tuple[Tensor,
             names = ", ".join(map(repr, keys))
             raise UserError(f"the batch has no {key!r}: give transitions with {names}.")
     return entries
+
+
+def with_action(reward: Any, entries: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
+    """What ``reward`` reads, with an empty action in second place where it reads no actions."""
+    if reads_actions(reward):
+        return entries
+    observation, *others = entries
+    dims = getattr(reward.scaler, "event_dims", 1)
+    return observation, reward.actions.nothing(observation, dims), *others
+
+
+def reads_actions(reward: Any) -> bool:
+    """Whether a reward reads actions, which one that has no ``actions`` of ours does or not."""
+    return getattr(getattr(reward, "actions", None), "use_actions", True)
 
 
 def check_transitions(

@@ -191,7 +191,7 @@ _OPTIONAL: dict[str, Check] = {
     **dict.fromkeys(("profile", "demo", "demo_id", "processor"), _or_none(_text)),
     **dict.fromkeys(_SECONDS_AND_RETURNS, _or_none(_number)),
     **dict.fromkeys(("inexact_resumes", "held_action"), _count),
-    "demo_transitions": _or_none(_count),
+    **dict.fromkeys(("demo_transitions", "demo_pairs"), _or_none(_count)),
     "random_policy": _is(bool),
 }
 

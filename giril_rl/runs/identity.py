@@ -48,7 +48,11 @@ ADDED = {
     "ppo.clip_value": False,
     "demo.lives": "first",
     "clip_reward": False,
+    "reward.absorbing": None,
+    "reward.every": 20,
     "held_episodes": 20,
+    "demo.first": None,
+    **dict.fromkeys(("reward.use_actions", "giril.use_actions", "icm.use_actions"), True),
 }
 """Keys that earlier versions did not have, with the value that they behaved by."""
 RETIRED = {"profile": "released", "batch_mean": True}

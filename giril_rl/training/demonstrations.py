@@ -15,7 +15,12 @@ from torch import Tensor
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from giril_rl.config.schema import DemoConfig, DemoRunConfig, ExpertConfig, RunConfig, TaskConfig
-from giril_rl.demos import Demonstration, check_demonstration, record_demonstration
+from giril_rl.demos import (
+    Demonstration,
+    check_demonstration,
+    record_demonstration,
+    shortened,
+)
 from giril_rl.demos.check import check_environment
 from giril_rl.demos.shipped import demonstration_folder, is_shipped
 from giril_rl.envs import gym_factory
@@ -61,14 +66,14 @@ def check_inputs(
     expert, demo = expert or cfg.expert, demo or cfg.demo
     check_task(cfg)
     if demo.path is not None:
-        _given_demonstration(cfg, demo.path)
+        _given_demonstration(cfg, demo)
     elif expert.path is not None:
         folder, _ = obtain_expert(cfg, expert)
         load_agent(folder, cfg.task)
 
 
-def _given_demonstration(cfg: RunConfig, path: str) -> Demonstration:
-    task = cfg.task
+def _given_demonstration(cfg: DemoRunConfig, chosen: DemoConfig) -> Demonstration:
+    task, path = cfg.task, str(chosen.path)
     folder = demonstration_folder(path, task, cfg.seed)
     shape, spec = spaces_of(task)
     demo = Demonstration.load(folder)
@@ -77,7 +82,38 @@ def _given_demonstration(cfg: RunConfig, path: str) -> Demonstration:
         check_demonstration(demo, shape, spec)
     except UserError as error:
         raise UserError(f"demo.path={path} does not fit {task.name}: {error}") from None
-    return demo
+    if not demo.has_actions and cfg.needs_actions is not None:
+        raise UserError(f"demo.path={path} has no actions, which {cfg.needs_actions}.")
+    return _used_part(demo, cfg, chosen)
+
+
+def _used_part(demo: Demonstration, cfg: DemoRunConfig, chosen: DemoConfig) -> Demonstration:
+    used = shortened(demo, episodes=chosen.episodes, first=chosen.first)
+    check_replay(cfg, len(used))
+    return used
+
+
+def check_replay(cfg: RunConfig, transitions: int) -> None:
+    """Refuses a replay buffer that cannot hold the demonstration that is put into it.
+
+    Args:
+        cfg: the run's settings.
+        transitions: of the demonstration, before 1 in ``demo.subsample`` is kept.
+
+    Raises:
+        UserError: with ``algorithm=sac``, if ``sac.buffer_size`` is too small.
+    """
+    sac = getattr(cfg, "sac", None)
+    if getattr(cfg, "algorithm", None) != "sac" or getattr(sac, "demonstration", "none") == "none":
+        return
+    demo = getattr(cfg, "demo", None)
+    pairs = -(-transitions // (demo.subsample if isinstance(demo, DemoConfig) else 1))
+    size = getattr(sac, "buffer_size", None)
+    if size is not None and size < pairs:
+        raise UserError(
+            f"sac.buffer_size={size} is smaller than the demonstration, of which {pairs:,} "
+            "transitions are kept in the replay: give a larger one, or set sac.demonstration=none."
+        )
 
 
 def obtain_demonstration(
@@ -85,7 +121,8 @@ def obtain_demonstration(
 ) -> tuple[Demonstration, dict[str, Any] | None]:
     """The demonstration that a recipe asks for, recorded first if need be, and its expert's result.
 
-    Of a given demonstration the result has only ``return_mean``, if its card tells it, and is None
+    It is as much of it as ``demo.episodes`` and ``demo.first`` say. Of a given demonstration the
+    result has only ``return_mean``, if its card tells it, and is None
     otherwise.
 
     Args:
@@ -94,14 +131,15 @@ def obtain_demonstration(
         demo: the demonstration's; None takes those of ``cfg``.
 
     Raises:
-        UserError: if the demonstration does not fit the task.
+        UserError: if the demonstration does not fit the task, has no actions where they are read,
+            or is shorter than what is to be used of it.
     """
     expert, demo = expert or cfg.expert, demo or cfg.demo
     settings = expert_settings(cfg, expert)
     has_player = (out_folder("expert", settings, {}) / "result.json").exists()
     announce(cfg, expert, demo, has_player=has_player)
     if demo.path is not None:
-        given = _given_demonstration(cfg, demo.path)
+        given = _given_demonstration(cfg, demo)
         return given, _known_expert(given)
     source, result = obtain_expert(cfg, expert)
     task = as_recorded_task(cfg.task, demo.lives)
@@ -122,7 +160,7 @@ def obtain_demonstration(
                 lives=demo.lives if task.family.has_lives else None,
             )
             recorded.save(folder)
-    return Demonstration.load(folder), result
+    return _used_part(Demonstration.load(folder), cfg, demo), result
 
 
 def _known_expert(demo: Demonstration) -> dict[str, Any] | None:
@@ -153,7 +191,7 @@ def demonstration_place(cfg: RunConfig, demo: DemoConfig, expert: str) -> Path:
 
 def _identity(task: TaskConfig, demo: DemoConfig, expert: str) -> str:
     """Twelve hex digits of what decides a demonstration."""
-    unread = {"path", "subsample"} | (set() if task.family.has_lives else {"lives"})
+    unread = {"path", "subsample", "first"} | (set() if task.family.has_lives else {"lives"})
     chosen = {key: value for key, value in asdict(demo).items() if key not in unread}
     parts = without_added({"demo": chosen, "task": asdict(task)}, drop=NO_EFFECT)
     identity = json.dumps([parts["demo"], parts["task"], expert], sort_keys=True)
@@ -202,7 +240,10 @@ def find_demonstration(folder: Path, within: Path) -> Demonstration | None:
         place = next((path for path in places if _is_inside(path / "card.json", within)), None)
     if place is None:
         return None
-    found = Demonstration.load(place)
+    try:
+        found = shortened(Demonstration.load(place), episodes=demo.episodes, first=demo.first)
+    except UserError:
+        return None
     return found if len(found) == result.get("demo_transitions") else None
 
 

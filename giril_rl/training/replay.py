@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import zlib
 from collections.abc import Sequence
 from pathlib import Path
@@ -187,12 +186,6 @@ class Replay:
             values = column[rows].contiguous().view(torch.uint8)
             total = zlib.crc32(values.numpy().data, total)
         return total
-
-    def delete(self) -> None:
-        """Removes the files; nothing can be drawn afterwards."""
-        self._buffer, self._columns = None, []
-        if self.folder is not None:
-            shutil.rmtree(self.folder, ignore_errors=True)
 
 
 class _Latest(Sampler):

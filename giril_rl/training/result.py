@@ -94,10 +94,11 @@ def finish_run(
         "inexact_resumes": trained.inexact_resumes,
         "steps_per_second": trained.steps / max(trained.seconds, 1e-9),
         "expert_return_mean": None if expert is None else expert["return_mean"],
-        "demo_return_mean": _mean_return(demo) if demo is not None and has_score else None,
+        "demo_return_mean": demo.mean_return() if demo is not None and has_score else None,
         "demo": None if demo is None else _source(cfg, demo),
         "demo_id": None if demo is None else demo.demo_id,
         "demo_transitions": None if demo is None else len(demo),
+        "demo_pairs": None if demo is None else _pairs(cfg, demo),
         "config_hash": config_hash(cfg),
         "versions": run.versions,
         "processor": processor(),
@@ -174,9 +175,7 @@ def _seeds_of(demo: Demonstration | None) -> dict[str, int | None]:
     return {"expert": seed, "demo": demo.card.get("seed")}
 
 
-def _mean_return(demo: Demonstration) -> float:
-    """Mean over whole episodes; a cut one counts only where there is no other."""
-    returns = demo.returns
-    if not demo.transitions["next", "done"][-1] and len(returns) > 1:
-        returns = returns[:-1]
-    return returns.mean().item()
+def _pairs(cfg: RunConfig, demo: Demonstration) -> int:
+    """The transitions that were learned from, once 1 in ``demo.subsample`` was kept."""
+    chosen = getattr(cfg, "demo", None)
+    return -(-len(demo) // (chosen.subsample if isinstance(chosen, DemoConfig) else 1))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -244,8 +245,8 @@ class SAC:
 
     def close(self) -> None:
         """Deletes the replay buffer, once training is over."""
-        if self.replay is not None:
-            self.replay.delete()
+        if self._folder is not None:
+            shutil.rmtree(self._folder, ignore_errors=True)
 
 
 class _Exploring(TensorDictModuleBase):
@@ -306,6 +307,7 @@ def _loss(agent: SACAgent, cfg: SACConfig) -> SACLoss | DiscreteSACLoss:
         loss = (SACLoss if tuned else _FixedSACLoss)(
             agent.actor_for_loss(), agent.critic(), **settings
         )
+        assert loss.target_entropy is not None  # It becomes a buffer when it is first read.
     loss.make_value_estimator(ValueEstimators.TD0, gamma=cfg.gamma)
     return loss.to(agent.device)
 

@@ -30,6 +30,7 @@ from giril_rl.rewards import (
 )
 from giril_rl.rewards.airl import AIRLReward
 from giril_rl.rewards.method import GREY, Method, register, unregister
+from giril_rl.rewards.red import DistillationReward
 
 PAIR, STATES = ("observation", "action"), ("observation", "next_observation")
 
@@ -76,6 +77,11 @@ VARIANTS = [
     Case("gail-absorbing", GAIL(absorbing=True)),
     Case("vail-absorbing-pixels", of_pixels(BottleneckReward, *PAIR, absorbing=True), "pixels"),
     Case("airl-state-only", airl_of_states, "box", STATES, takes_keys=False),
+    Case("giril-states", GIRIL(use_actions=False), depends_on=STATES, deterministic=False),
+    Case("icm-states", of_vectors(CuriosityReward, use_actions=False), "discrete"),
+    Case("gail-states", GAIL(use_actions=False)),
+    Case("vail-states", VAIL(use_actions=False), "discrete"),
+    Case("red-states", of_vectors(DistillationReward, *PAIR, use_actions=False), "discrete"),
     Case("copy", copied),
     Case("constant", lambda c: ConstantReward(2.0, out_keys=c.out_keys)),
     Case(
@@ -87,6 +93,16 @@ VARIANTS = [
     Case("giril-pixels-noise", of_pixels(GenerativeReward, beta=0.9), "pixels", None, False),
     Case("gail-pixels", of_pixels(DiscriminatorReward, *PAIR, form="negative"), "pixels"),
     Case("copy-pixels", copied_pixels, "pixels"),
+    Case(
+        "giril-pixels-states",
+        of_pixels(GenerativeReward, use_actions=False),
+        "pixels",
+        deterministic=False,
+    ),
+    Case("icm-pixels-states", of_pixels(CuriosityReward, use_actions=False), "pixels"),
+    Case("gail-pixels-states", of_pixels(DiscriminatorReward, *PAIR, use_actions=False), "pixels"),
+    Case("vail-pixels-states", of_pixels(BottleneckReward, *PAIR, use_actions=False), "pixels"),
+    Case("red-pixels-states", of_pixels(DistillationReward, *PAIR, use_actions=False), "pixels"),
 ]
 CASES = [*registered_cases(), *VARIANTS]
 WITH_KEYS = [case for case in CASES if case.takes_keys]

@@ -16,6 +16,17 @@ DEMO = {"expert.steps": 2000, "demo.length": 40, "demo.subsample": 2}
 FIT = {"fit.steps": 20, "fit.log_every": 10}
 SMALL = {"reward.hidden": "[16]"}
 BULLET = {"task": "inverted_pendulum", "task.env_id": None}
+SAC = {
+    "algorithm": "sac",
+    "sac.num_envs": 2,
+    "sac.rollout": 8,
+    "sac.batch": 8,
+    "sac.hidden": "[16,16]",
+    "sac.random_steps": 32,
+    "sac.buffer_size": 100,
+    "sac.checkpoint_every": 64,
+    "sac.log_every": 32,
+}
 RECIPES = {
     "expert": {**PPO, "stop_early": "false"},
     "giril": {**PPO, **DEMO, **FIT, **SMALL, **BULLET, "reward.beta": 0.7},
@@ -24,6 +35,7 @@ RECIPES = {
     "vail": {**PPO, **DEMO, **SMALL, **BULLET},
     "bc": {**PPO, **DEMO, "steps": 0, "bc.steps": 2040, "bc.log_every": 120},
     "control": {**PPO, **DEMO, **FIT, "reward": "noise"},
+    "sac": {**PPO, **DEMO, **FIT, **SMALL, **SAC, **BULLET},
 }
 GAME = {
     **PPO,
@@ -41,7 +53,7 @@ GAMES = {
     "player": {**GAME, "steps": 16, "stop_early": "false"},
     "game": {**GAME, "demo.subsample": 2, "fit.steps": 4, "fit.batch": 4, "fit.log_every": 2},
 }
-RECIPE_OF = {"game": "giril", "player": "expert"}
+RECIPE_OF = {"game": "giril", "player": "expert", "sac": "red"}
 
 
 def words(recipe, root, **more):
