@@ -62,7 +62,7 @@ class DiscriminatorConfig:
     lr: float = knob(1e-3, "Adam step size (paper: 1e-3)", low=0, low_open=True)
     updates: int = knob(10, "gradient steps with each batch of PPO; off-policy see `every`", low=1)
     every: int = knob(
-        10, "off-policy: environment steps that `updates` gradient steps go to", low=1
+        20, "off-policy: environment steps that `updates` gradient steps go to", low=1
     )
     batch: int = knob(250, "most pairs of expert and of policy in each gradient step", low=1)
     penalty: float = knob(1.0, "weight of the gradient penalty; 0 leaves it out", low=0)
