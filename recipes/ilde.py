@@ -30,6 +30,7 @@ from giril_rl.rewards import (
 )
 from giril_rl.rewards.entropy_bonus import EntropyBonusConfig, entropy_bonus
 from giril_rl.rewards.ilde import ILDEConfig, InMinibatches, SummedReward, Term
+from giril_rl.rewards.pwil import PWILConfig, pwil_reward
 from giril_rl.training import (
     AdversarialTrainer,
     Run,
@@ -47,6 +48,16 @@ from giril_rl.transforms import IntrinsicReward
 
 
 @dataclass
+class Coupling(PWILConfig):
+    """PWIL's settings, which are read only where PWIL is the imitation reward."""
+
+    def check(self, prefix: str, run: Any) -> None:
+        """Refuses what PWIL does."""
+        if run.reward.along_time:
+            super().check(prefix, run)
+
+
+@dataclass
 class Config(RewardRunConfig):
     """What `giril run ilde` takes; settings of a term that is switched off are not read."""
 
@@ -54,6 +65,7 @@ class Config(RewardRunConfig):
     gail: AdversarialConfig = field(default_factory=AdversarialConfig)
     vail: BottleneckConfig = field(default_factory=BottleneckConfig)
     giril: GenerativeConfig = field(default_factory=GenerativeConfig)
+    pwil: Coupling = field(default_factory=Coupling)
     bonus: EntropyBonusConfig = field(default_factory=EntropyBonusConfig)
     fit: FitConfig = field(default_factory=FitConfig)
 
@@ -70,7 +82,10 @@ def main(cfg: Config, out: Path) -> None:
         weights, terms = cfg.reward, {}
         loss: DiscriminatorLoss | None = None
         absorbing: list[Transform] = []
-        if weights.imitates:
+        if weights.along_time:
+            coupling = pwil_reward(cfg.pwil, env, pairs, seed=cfg.reward_seed).to(cfg.device)
+            terms["imitation"] = Term(weights.imitation_weight, coupling)
+        elif weights.imitates:
             loss = discriminator(cfg, env, pairs)
             terms["imitation"] = Term(weights.imitation_weight, loss.reward)
             absorbing = absorbing_value(loss.reward, cfg.learner.gamma, weights.imitation_weight)
@@ -82,7 +97,7 @@ def main(cfg: Config, out: Path) -> None:
         reward = SummedReward(terms)
 
         transform = Compose(IntrinsicReward(reward), *absorbing, *return_scaling(cfg))
-        moving = weights.imitates or weights.bonus_weight > 0
+        moving = not weights.along_time and (weights.imitates or weights.bonus_weight > 0)
         learner = make_algorithm(env, cfg, run=run, demo=demo, transform=transform, moving=moving)
         trainer = None
         if loss is not None:

@@ -62,6 +62,11 @@ class BatchedEnv(EnvBase):
             done=flag.clone(), terminated=flag.clone(), truncated=flag.clone(), shape=(n,)
         )
 
+    @property
+    def time_limit(self) -> int | None:
+        """Steps after which an episode is cut off, None where nothing does or it is not known."""
+        return None
+
     def step_and_maybe_reset(
         self, tensordict: TensorDictBase
     ) -> tuple[TensorDictBase, TensorDictBase]:

@@ -26,6 +26,7 @@ from giril_rl.envs.gym_api import (
     check_step,
     env_name,
     fill_unbounded,
+    shortest_limit,
     silent_stdout,
     without_bookkeeping,
 )
@@ -114,6 +115,12 @@ class GymVectorEnv(BatchedEnv):
                 "vector (one-dimensional Box) observation."
             )
         return Unbounded((self.batch_size[0], *space.shape), dtype=torch.float32)
+
+    @property
+    def time_limit(self) -> int | None:
+        """Steps after which an episode is cut off, None where nothing does."""
+        limits = (self._limit, shortest_limit(self._gym_envs[0]))
+        return min((limit for limit in limits if limit is not None), default=None)
 
     def rand_action(self, tensordict: TensorDictBase | None = None) -> TensorDictBase:
         """TorchRL's, and :func:`fill_unbounded` where a dimension lacks a bound."""

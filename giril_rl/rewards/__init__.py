@@ -49,7 +49,16 @@ from giril_rl.rewards.generative import (
     generative_reward,
     reconstruction_error,
 )
+from giril_rl.rewards.pwil import PWILConfig, PWILReward, greedy_coupling, pwil_reward, pwil_value
 from giril_rl.rewards.scaler import ObservationScaler, PixelScaler, ScalingRule
+from giril_rl.rewards.sinkhorn import (
+    SinkhornConfig,
+    SinkhornReward,
+    sinkhorn_plan,
+    sinkhorn_reward,
+    sinkhorn_value,
+)
+from giril_rl.rewards.trajectory import TrajectoryReward, fresh_episodes
 
 __all__ = [
     "ActionEncoder",
@@ -73,10 +82,15 @@ __all__ = [
     "GenerativeRewardLoss",
     "NoiseReward",
     "ObservationScaler",
+    "PWILConfig",
+    "PWILReward",
     "PixelScaler",
     "Prior",
     "RewardForm",
     "ScalingRule",
+    "SinkhornConfig",
+    "SinkhornReward",
+    "TrajectoryReward",
     "TransitionLoss",
     "action_term",
     "adversarial_reward",
@@ -89,8 +103,15 @@ __all__ = [
     "factored_error",
     "feature_error",
     "fit",
+    "fresh_episodes",
     "gaussian_kl",
     "generative_reward",
     "gradient_penalty",
+    "greedy_coupling",
+    "pwil_reward",
+    "pwil_value",
     "reconstruction_error",
+    "sinkhorn_plan",
+    "sinkhorn_reward",
+    "sinkhorn_value",
 ]

@@ -27,7 +27,9 @@ class ILDEConfig:
     """What ILDE adds up. A term of weight 0 is neither trained nor computed."""
 
     imitation: str = knob(
-        "gail", "the discriminator that r_imitation is of", choices=("gail", "vail", "none")
+        "gail",
+        "r_imitation: of a discriminator, gail or vail, or PWIL's coupling",
+        choices=("gail", "vail", "pwil", "none"),
     )
     imitation_weight: float = knob(1.0, "weight of r_imitation", low=0)
     curiosity_weight: float = knob(
@@ -38,8 +40,13 @@ class ILDEConfig:
 
     @property
     def imitates(self) -> bool:
-        """Whether there is a discriminator."""
+        """Whether there is an imitation reward."""
         return self.imitation != "none" and self.imitation_weight > 0
+
+    @property
+    def along_time(self) -> bool:
+        """Whether it is PWIL's, which is computed once, in order of time."""
+        return self.imitates and self.imitation == "pwil"
 
     def check(self, prefix: str, run: object) -> None:
         """Refuses a sum of nothing."""

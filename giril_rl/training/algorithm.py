@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable
 from typing import Any, Protocol, cast
 
@@ -10,12 +9,12 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
-from giril_rl.config.schema import RunConfig, ScalingConfig
-from giril_rl.demos import Demonstration
+from giril_rl.config.schema import DemoRunConfig, RunConfig, ScalingConfig
+from giril_rl.demos import Demonstration, subsample
 from giril_rl.envs import BatchedEnv
-from giril_rl.errors import UserError
 from giril_rl.policies.agent import Agent
 from giril_rl.policies.making import make_agent, make_sac_agent
+from giril_rl.rewards.trajectory import fresh_episodes, trajectory_rewards
 from giril_rl.runs.randomness import Use
 from giril_rl.runs.run import Run
 from giril_rl.training.ppo import PPO
@@ -105,8 +104,7 @@ def make_algorithm(
         use: what the random numbers are for.
 
     Raises:
-        UserError: if the algorithm has no form for the environment's spaces, or the replay buffer
-            is smaller than the demonstration.
+        UserError: if the algorithm has no form for the environment's spaces.
     """
     termination = getattr(cfg, "termination", "ends")
     if cfg.algorithm == "ppo":
@@ -124,6 +122,7 @@ def make_algorithm(
         folder=run.folder / REPLAY,
         demonstration=known,
         relabel=transform if moving else None,
+        relabel_episodes=_of_whole_episodes(transform),
         scaling=_scaling(scaling, cfg.sac.gamma) if isinstance(scaling, ScalingConfig) else None,
         termination=termination,
         absorbing=absorbing,
@@ -136,6 +135,19 @@ def _scaling(cfg: ScalingConfig, gamma: float) -> ReturnScaling | None:
     return ReturnScaling(gamma, reset=cast(ResetRule, cfg.reset), clip=cfg.clip)
 
 
+def _of_whole_episodes(transform: nn.Module | None) -> Callable[..., TensorDictBase] | None:
+    """What relabels whole episodes, where a reward is known at an episode's end only."""
+    parts = [] if transform is None else trajectory_rewards(transform)
+    if transform is None or not any(part.whole_episodes for part in parts):
+        return None
+
+    def relabel(episode: TensorDictBase) -> TensorDictBase:
+        with fresh_episodes(transform, learn=True):
+            return transform(episode)
+
+    return relabel
+
+
 def _demonstrated(
     demo: Demonstration,
     cfg: RunConfig,
@@ -143,17 +155,15 @@ def _demonstrated(
     moving: bool,
     reward: float | None,
 ) -> TensorDictBase:
-    """The demonstration's transitions, flat, with the reward to learn from."""
-    if len(demo) > cfg.sac.buffer_size:
-        raise UserError(
-            f"sac.buffer_size={cfg.sac.buffer_size} is less than the demonstration's {len(demo):,} "
-            "transitions: give the buffer more room, or set sac.demonstration=none."
-        )
-    known = demo.transitions.unsqueeze(0).to(cfg.device)
+    """The demonstration's transitions, 1 in ``demo.subsample``, with the reward to learn from.
+
+    The reward is that of the whole episodes, of which transitions are left out afterwards.
+    """
+    known = demo.transitions.clone(False)
     if reward is not None:
-        shape = known.get(("next", "done")).shape
-        known = known.set(("next", "reward"), torch.full(shape, reward, device=known.device))
+        known.set(("next", "reward"), torch.full((len(demo), 1), reward))
     elif transform is not None and not moving:
-        # A copy, for rewards of trajectories remember where they are.
-        known = copy.deepcopy(transform).to(cfg.device)(known)
-    return known.squeeze(0)
+        with fresh_episodes(transform):
+            known = transform(known.unsqueeze(0).to(cfg.device)).squeeze(0)
+    every = cfg.demo.subsample if isinstance(cfg, DemoRunConfig) else 1
+    return subsample(Demonstration(known.cpu()), every)

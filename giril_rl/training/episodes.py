@@ -1,9 +1,11 @@
-"""True returns and lengths of the episodes that end inside collected batches."""
+"""Episodes across collected batches: their true returns and lengths, and their steps held back."""
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
-from tensordict import TensorDictBase
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 
 
@@ -68,3 +70,75 @@ class EpisodeTracker(nn.Module):
         self.running_return.copy_(total[:, -1] - total[end][last])
         self.running_length.copy_(clock[:, -1] - clock[end][last])
         return returns, lengths
+
+
+class HeldEpisodes:
+    """Holds back the steps of running episodes until their episode ends.
+
+    Rewards that are known only then, such as Sinkhorn's, are computed of whole episodes.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> def batch(states, ends):
+        ...     states = torch.tensor(states)
+        ...     after = {"observation": states + 1, "done": torch.tensor(ends).unsqueeze(-1)}
+        ...     return TensorDict({"observation": states, "next": after}, states.shape[:2])
+        >>> held = HeldEpisodes()
+        >>> held.add(batch([[[0.0], [1.0]]], [[False, False]]))
+        []
+        >>> [whole] = held.add(batch([[[2.0], [7.0]]], [[True, False]]))
+        >>> whole["observation"].flatten()
+        tensor([0., 1., 2.])
+    """
+
+    def __init__(self) -> None:
+        self._held: TensorDictBase | None = None
+        self._begins: list[int] = []
+        self._onward = torch.zeros(0)
+
+    def add(self, batch: TensorDictBase) -> list[TensorDictBase]:
+        """Takes a batch ``(num_envs, time)``; gives the episodes that end in it, ``(1, length)``.
+
+        Where an environment does not go on from where it was, its running episode is dropped.
+        """
+        before = 0 if self._held is None else self._held.shape[1]
+        if self._held is None:
+            self._held, self._begins = batch, [0] * batch.shape[0]
+        else:
+            moved = (batch.get("observation")[:, 0] != self._onward).flatten(1).any(1)
+            for index in moved.nonzero().flatten().tolist():
+                self._begins[index] = before
+            self._held = torch.cat([self._held, batch], 1)
+        onward = batch.get(("next", "following_observation"), None)
+        onward = batch.get(("next", "observation")) if onward is None else onward
+        self._onward = onward[:, -1].clone()
+        episodes = []
+        for index, step in batch.get(("next", "done")).squeeze(-1).nonzero().tolist():
+            end = before + step + 1
+            episodes.append(self._held[index : index + 1, self._begins[index] : end])
+            self._begins[index] = end
+        first = min(self._begins)
+        self._held = self._held[:, first:]
+        self._begins = [begin - first for begin in self._begins]
+        return episodes
+
+    def state_dict(self) -> dict[str, Any]:
+        """The running episodes."""
+        if self._held is None:
+            return {}
+        columns = dict(self._held.flatten_keys(".").items())
+        return {
+            "begins": self._begins,
+            "columns": columns,
+            "shape": list(self._held.shape),
+            "onward": self._onward,
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restores what :meth:`state_dict` gave."""
+        if not state:
+            self._held, self._begins = None, []
+            return
+        self._held = TensorDict(state["columns"], state["shape"]).unflatten_keys(".")
+        self._begins, self._onward = list(state["begins"]), state["onward"]

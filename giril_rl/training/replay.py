@@ -16,6 +16,11 @@ from torchrl.data.replay_buffers import RoundRobinWriter, Sampler
 
 from giril_rl.errors import UserError
 
+_DTYPES = {
+    str(kind): kind
+    for kind in (torch.bool, torch.uint8, torch.int32, torch.int64, torch.float32, torch.float64)
+}
+
 
 class Replay:
     """TorchRL's replay buffer over memory-mapped files; minibatches are drawn uniformly.
@@ -33,10 +38,6 @@ class Replay:
         folder: where the files are; None keeps the transitions in memory.
         demonstration: a flat batch with ``keys``, or None.
         share: part of each minibatch that is demonstrated; None draws from all transitions alike.
-
-    Raises:
-        UserError: at the first :meth:`extend` after a checkpoint was loaded, if the files are not
-            those of that moment.
 
     Examples:
         >>> replay = Replay(["observation"], size=100)
@@ -62,6 +63,8 @@ class Replay:
         )
         self.written = 0
         self._sums: list[list[int]] = []  # First row, the row after the last, checksum.
+        self._kinds: list[tuple[torch.dtype, list[int]]] = []
+        self._columns: list[Tensor] = []
         self._buffer: TensorDictReplayBuffer | None = None
 
     def __len__(self) -> int:
@@ -71,14 +74,12 @@ class Replay:
     def extend(self, batch: TensorDictBase) -> None:
         """Adds a flat batch, of which later changes are not seen."""
         rows = batch.select(*self.keys)
-        self.open(rows).extend(rows)
-        self.written += len(rows)
-
-    def open(self, batch: TensorDictBase) -> TensorDictReplayBuffer:
-        """Opens the files of a resumed run, or makes new ones, for rows such as a flat batch's."""
         if self._buffer is None:
-            self._buffer = self._opened(batch.select(*self.keys))
-        return self._buffer
+            entries = [rows.get(key) for key in self.keys]
+            self._open([(entry.dtype, entry.shape[1:]) for entry in entries])
+        assert self._buffer is not None
+        self._buffer.extend(rows)
+        self.written += len(rows)
 
     def own(self, count: int) -> TensorDictBase:
         """Draws ``count`` of the agent's own transitions alone, see :meth:`sample`."""
@@ -113,60 +114,68 @@ class Replay:
             (torch.arange(count) % minibatch < round(minibatch * self.share)).nonzero().squeeze(-1)
         )
 
-    def _opened(self, rows: TensorDictBase) -> TensorDictReplayBuffer:
-        columns: dict[NestedKey, Tensor] = {}
-        for key in self.keys:
-            example = rows.get(key)
-            shape, kind = (self.capacity, *example.shape[1:]), example.dtype
-            columns[key] = self._column(key, shape, kind)
+    def _open(self, kinds: Sequence[tuple[torch.dtype, Sequence[int]]]) -> None:
+        """Makes the columns, or finds those of a checkpoint; ``kinds`` has one row's entries."""
+        self._kinds = [(kind, list(shape)) for kind, shape in kinds]
         storage = TensorDict(batch_size=[self.capacity])
-        for key, column in columns.items():
-            storage.set(key, column)
+        for key, (kind, shape) in zip(self.keys, self._kinds, strict=True):
+            storage.set(key, self._column(key, (self.capacity, *shape), kind))
+        self._columns = [storage.get(key) for key in self.keys]
         writer = RoundRobinWriter()
-        buffer = TensorDictReplayBuffer(
+        self._buffer = TensorDictReplayBuffer(
             storage=TensorStorage(storage), sampler=_Latest(self), writer=writer
         )
         writer.load_state_dict({**writer.state_dict(), "_cursor": self.written % self.capacity})
-        self._columns = list(columns.values())
-        self._check_sums()
-        return buffer
 
     def _column(self, key: NestedKey, shape: tuple[int, ...], kind: torch.dtype) -> Tensor:
         if self.folder is None:
             return torch.zeros(shape, dtype=kind)
-        name = ".".join(key) if isinstance(key, tuple) else key
-        path = self.folder / f"{name}.memmap"
+        path = self.folder / f"{_name(key)}.memmap"
         if not self.written:
             self.folder.mkdir(parents=True, exist_ok=True)
             path.unlink(missing_ok=True)
             return MemoryMappedTensor.empty(shape, dtype=kind, filename=str(path))
-        bytes_needed = torch.Size(shape).numel() * kind.itemsize
-        if not path.is_file() or path.is_symlink() or path.stat().st_size != bytes_needed:
+        needed = torch.Size(shape).numel() * kind.itemsize
+        if not path.is_file() or path.is_symlink() or path.stat().st_size != needed:
             raise self._damaged(f"{path.name} is missing or has another size")
         return MemoryMappedTensor.from_filename(str(path), kind, torch.Size(shape))
 
     def state_dict(self) -> dict[str, Any]:
-        """How many transitions were written, and checksums of those on disk.
+        """How many transitions were written and of what kind, with checksums of those on disk.
 
-        Transitions in memory alone are not saved.
+        The transitions themselves are not in it.
         """
         begin = self._sums[-1][1] if self._sums else 0
-        if self._buffer is not None and begin < self.written:
+        if begin < self.written:
             self._sums.append([begin, self.written, self._checksum(begin, self.written)])
         self._sums = [part for part in self._sums if part[1] > self.written - self.size]
-        return {"written": self.written, "sums": [list(part) for part in self._sums]}
+        return {
+            "written": self.written,
+            "sums": [list(part) for part in self._sums],
+            "keys": [_name(key) for key in self.keys],
+            "kinds": [[str(kind), list(shape)] for kind, shape in self._kinds],
+        }
+
+    @staticmethod
+    def keys_of(state: dict[str, Any]) -> list[NestedKey]:
+        """The keys that a buffer with this state has."""
+        keys = (tuple(name.split(".")) for name in state["keys"])
+        return [key if len(key) > 1 else key[0] for key in keys]
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Goes back to the moment of a checkpoint; the next :meth:`extend` opens its files.
+        """Goes back to the moment of a checkpoint.
 
         Raises:
+            UserError: if the files are not those of that moment.
             ValueError: if the transitions were in memory alone.
         """
         if state["written"] and self.folder is None:
             raise ValueError("the replay buffer was in memory, and is gone")
         self.written = state["written"]
         self._sums = [[int(number) for number in part] for part in state["sums"]]
-        self._buffer = None
+        if self.written:
+            self._open([(_DTYPES[kind], shape) for kind, shape in state["kinds"]])
+        self._check_sums()
 
     def _check_sums(self) -> None:
         for begin, end, checksum in self._sums:
@@ -186,6 +195,10 @@ class Replay:
             values = column[rows].contiguous().view(torch.uint8)
             total = zlib.crc32(values.numpy().data, total)
         return total
+
+
+def _name(key: NestedKey) -> str:
+    return ".".join(key) if isinstance(key, tuple) else key
 
 
 class _Latest(Sampler):

@@ -50,9 +50,9 @@ class RewardTrainer(Protocol):
         ...
 
 
-Source = Callable[[int, TensorDictBase], TensorDictBase | None]
-"""``source(count, batch)`` draws ``count`` of the policy's transitions, flat; None where there are
-none yet. ``batch`` is what was collected last and is not stored yet."""
+Source = Callable[[int], TensorDictBase | None]
+"""``source(count)`` draws ``count`` of the policy's transitions, flat; None where there are none
+yet."""
 
 
 class AdversarialTrainer:
@@ -139,7 +139,7 @@ class AdversarialTrainer:
         steps = self._due(len(policy[0]))
         with seeded(0, self._device):
             restore_rng(self._rng)
-            logs = [self._step(part) for part in self._minibatches(batch, policy, steps)]
+            logs = [self._step(part) for part in self._minibatches(policy, steps)]
             self._rng = rng_state(self._device)
         metrics = {
             f"discriminator/{name}": torch.stack([log[name] for log in logs]).mean().item()
@@ -157,13 +157,11 @@ class AdversarialTrainer:
         self._taken += transitions
         return self._taken * self.cfg.updates // self.cfg.every - before
 
-    def _minibatches(
-        self, batch: TensorDictBase, collected: list[Tensor], steps: int
-    ) -> Iterator[list[Tensor]]:
+    def _minibatches(self, collected: list[Tensor], steps: int) -> Iterator[list[Tensor]]:
         """The policy's part of ``steps`` minibatches."""
         size, drawn = self.cfg.batch, None
         if self.source is not None and steps:
-            drawn = self.source(steps * size, batch)
+            drawn = self.source(steps * size)
         if drawn is None:
             for _ in range(steps):
                 yield _drawn(collected, size)

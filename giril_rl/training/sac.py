@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from giril_rl.graphs.gradients import TracedGradients
 from giril_rl.policies.agent import ActingPolicy, collecting
 from giril_rl.policies.soft_actor_critic import DRAWN, SACAgent
 from giril_rl.runs.randomness import seeded, stream_seed
+from giril_rl.training.episodes import HeldEpisodes
 from giril_rl.training.replay import Replay
 from giril_rl.transforms.scaling import ReturnScaling
 
@@ -28,6 +29,8 @@ OBSERVATION, ACTION = "observation", "action"
 NEXT, ONWARD = ("next", "observation"), ("next", "following_observation")
 REWARD, TERMINATED = ("next", "reward"), ("next", "terminated")
 FLAGS = (("next", "done"), TERMINATED)
+STORED: tuple[NestedKey, ...] = (OBSERVATION, ACTION, NEXT, TERMINATED, ONWARD)
+"""What a minibatch has besides a stored reward; the last only where there are hidden resets."""
 
 
 class SAC:
@@ -45,6 +48,8 @@ class SAC:
         folder: where the replay buffer's files are; None keeps it in memory.
         demonstration: flat transitions with a reward, for ``cfg.demonstration``; None for none.
         relabel: a transform that writes the reward into a flat minibatch; None takes the stored.
+        relabel_episodes: writes the reward into whole episodes ``(1, length)``, which are stored
+            once they have ended; None stores each batch.
         scaling: divides rewards by its running standard deviation as they are drawn; it learns from
             each batch. None does not scale.
         termination: "ends" or "bootstrap", see :class:`~giril_rl.training.ppo.PPO`.
@@ -88,6 +93,7 @@ class SAC:
         folder: Path | None = None,
         demonstration: TensorDictBase | None = None,
         relabel: Callable[[TensorDictBase], TensorDictBase] | None = None,
+        relabel_episodes: Callable[[TensorDictBase], TensorDictBase] | None = None,
         scaling: ReturnScaling | None = None,
         termination: str = "ends",
         absorbing: Callable[[], Tensor] | None = None,
@@ -95,12 +101,17 @@ class SAC:
         if termination not in ("ends", "bootstrap"):
             raise UserError(f"termination={termination}: choose one of ends, bootstrap.")
         self.agent, self.cfg = agent, cfg
-        self.num_envs, self.checkpoint_every = cfg.num_envs, cfg.checkpoint_every
-        self.log_every = cfg.log_every
+        self.num_envs, self.log_every = cfg.num_envs, cfg.log_every
         self.frames_per_batch = cfg.num_envs * cfg.rollout
+        # Whole episodes come many transitions at a time.
+        share = 4 if relabel_episodes is None else 1
+        self._slack = max(cfg.buffer_size // share, 2 * self.frames_per_batch)
+        self.checkpoint_every = min(cfg.checkpoint_every, self._slack - self.frames_per_batch)
         self.steps = cfg.whole_batches(steps)
         self.bootstraps_failure = termination == "bootstrap"
         self.relabel, self.scaling, self.absorbing = relabel, scaling, absorbing
+        self.relabel_episodes = relabel_episodes
+        self.held = HeldEpisodes()
         self._taken = self._updates = 0
         self._demonstration, self._folder = demonstration, folder
         self.replay: Replay | None = None
@@ -128,36 +139,40 @@ class SAC:
         if self.scaling is not None:
             self.scaling.unfreeze()(batch)
             self.scaling.freeze()
-        flat = batch.flatten(0, 1)
-        if self.replay is None:
-            self.replay = self._replay(flat)
-        self.replay.extend(flat)
+        if self.relabel_episodes is None:
+            self._store(batch.flatten(0, 1))
+        else:
+            kept = batch.select(
+                *(key for key in STORED if key in batch.keys(True)), ("next", "done")
+            )
+            for episode in self.held.add(kept):
+                self._store(self.relabel_episodes(_without_reward(episode)).squeeze(0))
         self.agent.update_normaliser(batch.get(OBSERVATION))
-        self._taken += len(flat)
+        self._taken += batch.numel()
         due = int((self._taken - self.cfg.random_steps) * self.cfg.updates) - self._updates
-        if due <= 0:
+        if due <= 0 or not self.replay:
             return {}
         self._updates += due
         logs = [self._step(minibatch) for minibatch in self._minibatches(due)]
         return {key: torch.stack([log[key] for log in logs]).mean().item() for key in logs[0]}
 
-    def own(self, count: int, batch: TensorDictBase) -> TensorDictBase | None:
-        """Draws ``count`` of the agent's own transitions, flat, for a reward that learns beside it.
+    def _store(self, flat: TensorDictBase) -> None:
+        if self.replay is None:
+            keys = [key for key in STORED if key in flat.keys(True)]
+            self.replay = self._replay([*keys, REWARD] if self.relabel is None else keys)
+        self.replay.extend(flat)
+
+    def own(self, count: int) -> TensorDictBase | None:
+        """Draws ``count`` of the agent's own transitions, for a reward that learns beside it.
 
         Args:
             count: how many, drawn uniformly with torch's global generator.
-            batch: a collected batch ``(num_envs, time)``, by whose shapes a resumed run opens its
-                replay buffer. It is not stored.
 
         Returns:
-            The transitions; None where nothing was stored yet.
+            A flat batch without rewards to learn from; None where nothing was stored yet.
         """
-        flat = batch.flatten(0, 1)
-        if self.replay is None and self._saved_replay is not None:
-            self.replay = self._replay(flat)
         if self.replay is None or not len(self.replay):
             return None
-        self.replay.open(flat)
         return self.replay.own(count)
 
     def _step(self, minibatch: tuple[Tensor, ...]) -> dict[str, Tensor]:
@@ -173,8 +188,7 @@ class SAC:
         assert self.replay is not None
         drawn = self.replay.sample(count * cfg.batch, minibatch=cfg.batch).to(agent.device)
         if self.relabel is not None:
-            # The transform moves the true reward elsewhere; here is none.
-            drawn = self.relabel(drawn.set(REWARD, torch.zeros(len(drawn), 1, device=drawn.device)))
+            drawn = self.relabel(_without_reward(drawn))
         if self.scaling is not None:
             drawn = self.scaling(drawn)
         reward, terminated = drawn.get(REWARD), drawn.get(TERMINATED)
@@ -194,30 +208,20 @@ class SAC:
         )
         return zip(*(column.split(cfg.batch) for column in columns), strict=True)
 
-    def _replay(self, flat: TensorDictBase) -> Replay:
-        keys: list[NestedKey] = [OBSERVATION, ACTION, NEXT, TERMINATED]
-        if ONWARD in flat.keys(True):
-            keys.append(ONWARD)
-        if self.relabel is None:
-            keys.append(REWARD)
+    def _replay(self, keys: Sequence[NestedKey]) -> Replay:
         cfg, known = self.cfg, self._demonstration
         size = min(cfg.buffer_size, self.steps)
-        between = 0 if size == self.steps else cfg.checkpoint_every + self.frames_per_batch
+        slack = self._slack if size < self.steps else 0
         if known is not None and ONWARD in keys:
             known = known.clone(False).set(ONWARD, known.get(NEXT))
-        replay = Replay(
+        return Replay(
             keys,
             size=size,
-            slack=between,
+            slack=slack,
             folder=self._folder,
             demonstration=known,
             share=0.5 if cfg.demonstration == "half" else None,
         )
-        if self._saved_replay is not None:
-            replay.load_state_dict(self._saved_replay)
-        return replay
-
-    _saved_replay: dict[str, Any] | None = None
 
     def state_dict(self) -> dict[str, Any]:
         """Networks, optimizer and counters, and what finds the replay buffer as it is now."""
@@ -225,6 +229,7 @@ class SAC:
             "agent": dict(self.agent.state_dict()),
             "loss": dict(_tensors(self.loss)),
             "optimizer": self.optimizer.state_dict(),
+            "held": self.held.state_dict(),
             "replay": None if self.replay is None else self.replay.state_dict(),
             "scaling": None if self.scaling is None else dict(self.scaling.state_dict()),
             "steps": self._taken,
@@ -240,8 +245,12 @@ class SAC:
         self.optimizer.load_state_dict(state["optimizer"])
         if self.scaling is not None:
             self.scaling.load_state_dict(state["scaling"])
+        self.held.load_state_dict(state["held"])
         self._taken, self._updates = state["steps"], state["updates"]
-        self._saved_replay, self.replay = state["replay"], None
+        self.replay = None
+        if state["replay"] is not None:
+            self.replay = self._replay(Replay.keys_of(state["replay"]))
+            self.replay.load_state_dict(state["replay"])
 
     def close(self) -> None:
         """Deletes the replay buffer, once training is over."""
@@ -310,6 +319,12 @@ def _loss(agent: SACAgent, cfg: SACConfig) -> SACLoss | DiscreteSACLoss:
         assert loss.target_entropy is not None  # It becomes a buffer when it is first read.
     loss.make_value_estimator(ValueEstimators.TD0, gamma=cfg.gamma)
     return loss.to(agent.device)
+
+
+def _without_reward(batch: TensorDictBase) -> TensorDictBase:
+    """A shallow copy with zeros for the true reward, which a transform moves elsewhere."""
+    zeros = torch.zeros(*batch.shape, 1, device=batch.get(OBSERVATION).device)
+    return batch.clone(False).set(REWARD, zeros)
 
 
 def _tensors(module: nn.Module) -> dict[str, Tensor]:

@@ -56,6 +56,12 @@ class IntrinsicReward(RewardTransform):
     does not reach. :class:`~giril_rl.transforms.RewardWeightSyncScheme` sends new weights to the
     copies in a multi-process collector.
 
+    A module whose reward depends on an episode's earlier steps says ``along_time = True``, such as
+    :class:`giril_rl.rewards.TrajectoryReward`. It gets batches ``(*environments, time)``; in an
+    environment, one moment of all environments at a time. Split trajectories are refused, and so is
+    a place inside a worker, which sees one environment only. It also gets those of its
+    ``optional_keys`` that are there.
+
     Args:
         module: reads ``(s, a, s')``, e.g. ``"observation"``, ``"action"`` and
             ``("next", "observation")``; writes ``("next", "intrinsic_reward")``, shape
@@ -93,6 +99,9 @@ class IntrinsicReward(RewardTransform):
         super().__init__(reward_key, kept)
         self._result_key = _result_key(module)
         self.module = module
+        parts = [part for part in module.modules() if getattr(part, "along_time", False)]
+        self.along_time = self.needs_all_environments = bool(parts)
+        self._optional_keys = [key for part in parts for key in getattr(part, "optional_keys", ())]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Relabels a batch ``[N, T]`` or ``[B]``; returns a shallow copy."""
@@ -104,18 +113,27 @@ class IntrinsicReward(RewardTransform):
                 "extrinsic_key, or extrinsic_key=None to leave that one as it is."
             )
         true_reward = find_reward(next_td, self.reward_key)
-        view = batch.select(*self.module.in_keys)
-        self._relabel(view, next_td, true_reward, split_mask(batch))
+        there = [key for key in self._optional_keys if batch.get(key, None) is not None]
+        view = batch.select(*self.module.in_keys, *there)
+        mask = split_mask(batch)
+        if self.along_time and mask is not None:
+            raise UserError(
+                "the batch holds split trajectories and this reward follows each environment along "
+                "time: collect with split_trajs=False."
+            )
+        self._relabel(view, next_td, true_reward, mask)
         return batch
 
     def _step(self, tensordict: TensorDictBase, next_tensordict: TensorDictBase) -> TensorDictBase:
         view = TensorDict(batch_size=tensordict.batch_size, device=tensordict.device)
-        for key in self.module.in_keys:
+        for key in (*self.module.in_keys, *self._optional_keys):
             path = key if isinstance(key, tuple) else (key,)
-            if path[0] == "next":
-                view.set(key, next_tensordict.get(path[1:]))
-            else:
-                view.set(key, tensordict.get(key))
+            of_next = path[0] == "next"
+            entry = next_tensordict.get(path[1:], None) if of_next else tensordict.get(key, None)
+            if entry is not None or key not in self._optional_keys:
+                view.set(key, entry)
+        if self.along_time:
+            view = (view if view.ndim else view.unsqueeze(0)).unsqueeze(-1)
         self._relabel(view, next_tensordict, self._read_step(next_tensordict))
         return next_tensordict
 
@@ -140,6 +158,8 @@ class IntrinsicReward(RewardTransform):
         if reward is None:
             raise UserError(f"the reward module wrote no tensor under {self._result_key!r}.")
         shape = (*next_td.batch_size, 1) if true_reward is None else tuple(true_reward.shape)
+        if view.batch_size != next_td.batch_size:  # A single moment.
+            reward = reward.reshape(shape)
         if reward.shape != shape:
             raise UserError(
                 f"the reward module gave shape {tuple(reward.shape)} where the reward has "

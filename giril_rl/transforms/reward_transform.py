@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import ClassVar
 
 import torch
 from tensordict import TensorDictBase, unravel_key
@@ -23,7 +22,7 @@ class RewardTransform(Transform):
         out_keys: further keys that are written.
     """
 
-    needs_all_environments: ClassVar[bool] = False
+    needs_all_environments: bool = False
     """Whether it refuses to run inside a worker, which sees one environment only."""
 
     def __init__(self, reward_key: NestedKey, out_keys: Sequence[NestedKey] = ()) -> None:

@@ -60,6 +60,8 @@ def test_what_imitates():
     assert ILDEConfig().imitates and ILDEConfig(imitation="vail").imitates
     assert not ILDEConfig(imitation="none").imitates
     assert not ILDEConfig(imitation_weight=0.0).imitates
+    assert ILDEConfig(imitation="pwil").along_time and not ILDEConfig().along_time
+    assert not ILDEConfig(imitation="pwil", imitation_weight=0.0).along_time
 
 
 def test_sqil_pays_nothing_for_what_the_agent_does():

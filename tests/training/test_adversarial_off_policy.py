@@ -54,7 +54,7 @@ def seen_by(trainer, monkeypatch):
 
 
 def test_gradient_steps_follow_environment_steps(monkeypatch):
-    trainer = trainer_of(lambda count, batch: None, updates=3, every=10)
+    trainer = trainer_of(lambda count: None, updates=3, every=10)
     seen = seen_by(trainer, monkeypatch)
     counts = []
     for size in (4, 4, 4, 64, 1, 3):  # 3 steps for each 10: after 4, 8, 12, 76, 77 and 80.
@@ -67,7 +67,7 @@ def test_gradient_steps_follow_environment_steps(monkeypatch):
 def test_pairs_come_from_the_replay_once_it_has_any(monkeypatch):
     stored, asked = [], []
 
-    def source(count, batch):
+    def source(count):
         asked.append(count)
         if not stored:
             return None
@@ -130,7 +130,7 @@ def test_it_goes_on_from_its_state_bit_for_bit(tmp_path):
     def fresh():
         replay = Replay(["observation", "action"], size=100)
         replay.extend(pairs(50, seed=3))
-        return trainer_of(lambda count, batch: replay.own(count), updates=1, every=7)
+        return trainer_of(replay.own, updates=1, every=7)
 
     whole, first, second = fresh(), fresh(), fresh()
     batches = [pairs(2, 5, seed=k) for k in range(4)]

@@ -44,7 +44,7 @@ def learned(env, seed=0):
     return DiscriminatorReward.for_vectors(dim, env.action_spec, normalise="raw", seed=seed)
 
 
-def train(folder, *, kind="box", garbage=None, moving=False, known=False, **changes):
+def train(folder, *, kind="box", garbage=None, moving=False, whole=False, known=False, **changes):
     """Trains in ``folder`` with objects of its own; the checkpoint."""
 
     def make_fn():
@@ -67,6 +67,7 @@ def train(folder, *, kind="box", garbage=None, moving=False, known=False, **chan
             folder=folder / "replay",
             demonstration=demonstration,
             relabel=transform if moving else None,
+            relabel_episodes=transform if whole else None,
             scaling=ReturnScaling(0.99),
         )
         train_policy(env, sac, transform, seed=0, run=run)
@@ -100,6 +101,7 @@ def assert_equal(found, expected, path=""):
     [
         ("discrete", {}),
         ("box", {"moving": True}),
+        ("box", {"whole": True}),
         ("box", {"entropy": "none", "normalise_observations": True}),
     ],
 )
@@ -174,6 +176,32 @@ def test_a_moving_reward_is_that_of_now(tmp_path):
     assert torch.equal(*both["stored"])
     assert not torch.allclose(*both["moving"])
     assert torch.allclose(both["stored"][0], both["moving"][0], atol=1e-5)
+
+
+def test_episodes_that_are_held_back_are_stored_whole_once_they_end():
+    """Each as one batch, of one environment, with the transitions that led there."""
+    seen = []
+
+    def relabel(episode):
+        seen.append(episode.clone())
+        return episode
+
+    env = GymVectorEnv(lambda: gymnasium.make("CartPole-v1"), 4, max_episode_steps=30)
+    cfg = replace(CFG, random_steps=10_000)
+    sac = SAC(make_sac_agent(env, cfg, seed=0), cfg, steps=STEPS, relabel_episodes=relabel)
+    torch.manual_seed(0)
+    data = env.rollout(160, sac.act(), break_when_any_done=False)
+    for part in data.split(8, 1):
+        sac.update(part)
+    assert sum(episode.numel() for episode in seen) == sac.replay.written > 400
+    for episode in seen:
+        done = episode["next", "done"][0, :, 0]
+        assert done[-1] and not done[:-1].any()
+        assert torch.equal(episode["observation"][:, 1:], episode["next", "observation"][:, :-1])
+        assert not episode["next", "reward"].any()  # The true one, which is 1.
+    ended = data["next", "done"].squeeze(-1)
+    left = [160 - (int(row.nonzero()[-1]) + 1) for row in ended]
+    assert data.numel() - sac.replay.written == sum(left)
 
 
 def test_gradient_steps_are_as_many_as_asked(tmp_path):
