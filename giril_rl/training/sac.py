@@ -162,6 +162,19 @@ class SAC:
             self.replay = self._replay([*keys, REWARD] if self.relabel is None else keys)
         self.replay.extend(flat)
 
+    def own(self, count: int) -> TensorDictBase | None:
+        """Draws ``count`` of the agent's own transitions, for a reward that learns beside it.
+
+        Args:
+            count: how many, drawn uniformly with torch's global generator.
+
+        Returns:
+            A flat batch without rewards to learn from; None where nothing was stored yet.
+        """
+        if self.replay is None or not len(self.replay):
+            return None
+        return self.replay.own(count)
+
     def _step(self, minibatch: tuple[Tensor, ...]) -> dict[str, Tensor]:
         log = self.gradients.step(minibatch)
         self.optimizer.step()
