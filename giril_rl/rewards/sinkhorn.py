@@ -112,7 +112,7 @@ def sinkhorn_value(cost: Tensor, regularisation: float = 0.01, iterations: int =
 
     Args:
         cost: ``(L, n)``, between an episode's L steps and the demonstration's n.
-        regularisation: entropic regularisation, in units of the mean cost.
+        regularisation: in units of the mean cost.
         iterations: Sinkhorn steps.
 
     Examples:
