@@ -1,6 +1,6 @@
 """VAIL: GAIL with a discriminator that sees a pair only through an information bottleneck.
 
-Demonstration -> discriminator <-> PPO on its reward -> score on the true reward.
+Demonstration -> discriminator <-> policy on its reward -> score on the true reward.
 """
 
 from __future__ import annotations
@@ -16,11 +16,13 @@ from giril_rl.envs import make_env
 from giril_rl.rewards import BottleneckConfig, BottleneckLoss, bottleneck_reward
 from giril_rl.training import (
     AdversarialTrainer,
+    absorbing_value,
     finish_run,
     make_algorithm,
     obtain_demonstration,
     open_run,
     return_scaling,
+    terminal_rate,
     train_policy,
 )
 from giril_rl.transforms import IntrinsicReward
@@ -43,7 +45,8 @@ def main(cfg: Config, out: Path) -> None:
         env = run.closing(make_env(cfg.task, cfg.learner.num_envs, cfg.seed))
 
         seed = cfg.reward_seed
-        reward = bottleneck_reward(cfg.reward, env, pairs, seed=seed).to(cfg.device)
+        settings = cfg.reward.settled(cfg)
+        reward = bottleneck_reward(settings, env, pairs, seed=seed).to(cfg.device)
         loss = BottleneckLoss(
             reward,
             information=cfg.reward.information,
@@ -51,13 +54,21 @@ def main(cfg: Config, out: Path) -> None:
             beta=cfg.reward.beta_start,
             penalty=cfg.reward.penalty,
         )
-        trainer = AdversarialTrainer(loss, pairs, cfg.reward, seed=seed)
 
         transform = Compose(
             IntrinsicReward(reward),
+            *absorbing_value(reward, cfg.learner.gamma),
             *return_scaling(cfg),
         )
         learner = make_algorithm(env, cfg, run=run, demo=demo, transform=transform, moving=True)
+        trainer = AdversarialTrainer(
+            loss,
+            pairs,
+            settings,
+            seed=seed,
+            source=learner.own,
+            terminal_rate=terminal_rate(demo.transitions),
+        )
         trained = train_policy(
             env, learner, transform, seed=cfg.seed, run=run, reward_trainer=trainer
         )

@@ -47,6 +47,28 @@ class DiagonalGaussian:
         constant = HALF_LOG_TWO_PI * self.log_std.shape[-1]
         return scaled.square().sum(-1) * -0.5 - (self.log_std.sum() + constant)
 
+    def clamped_log_prob(self, draw: Tensor, at_low: Tensor, at_high: Tensor) -> Tensor:
+        """Log-probability ``(*batch,)`` of a draw that was clamped to bounds.
+
+        Inside the bounds it is the log density. A dimension at a bound has the log-probability of
+        all draws beyond it, however far.
+
+        Args:
+            draw: the clamped draw, ``(*batch, action_dim)``.
+            at_low: whether it is at the lower bound, of the same shape.
+            at_high: whether it is at the upper one.
+
+        Examples:
+            >>> d = DiagonalGaussian(torch.zeros(2, 1), torch.zeros(1))
+            >>> at_high = torch.tensor([[False], [True]])
+            >>> d.clamped_log_prob(torch.zeros(2, 1), torch.tensor(False), at_high).exp()
+            tensor([0.3989, 0.5000])
+        """
+        scaled = (draw - self.mean) * (-self.log_std).exp()
+        inside = scaled.square() * -0.5 - (self.log_std + HALF_LOG_TWO_PI)
+        beyond = torch.special.log_ndtr(torch.where(at_high, -scaled, scaled))
+        return torch.where(at_low | at_high, beyond, inside).sum(-1)
+
     def entropy(self) -> Tensor:
         """Differential entropy, ``(*batch,)``."""
         size = self.log_std.shape[-1]

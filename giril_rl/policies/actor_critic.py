@@ -46,6 +46,15 @@ class PPOAgent(Agent):
         """The environment's action for a sample of the distribution."""
         return drawn if self.bounds is None else self.bounds(drawn)
 
+    def log_prob(self, observation: Tensor, action: Tensor) -> Tensor:
+        """Log-probability ``(*batch,)`` of an environment's actions, without gradient.
+
+        Args:
+            observation: raw observations ``(*batch, ...)``, where the weights are.
+            action: actions as the environment takes them, of any policy.
+        """
+        raise NotImplementedError
+
     def prepare(self, batch: TensorDictBase, following: Tensor) -> None:
         """Writes into a collected batch what the advantages and the loss read.
 
@@ -200,6 +209,27 @@ class ActorCritic(PPOAgent):
         drawn = distribution.mode if greedy else distribution.sample()
         acted = (self.executed(drawn), distribution.log_prob(drawn), normalised)
         return acted if self.bounds is None else (*acted, drawn)
+
+    @torch.no_grad()
+    def log_prob(self, observation: Tensor, action: Tensor) -> Tensor:
+        """Log-probability ``(*batch,)`` of actions as the environment takes them.
+
+        A Gaussian's is a density in units in which the bounds are -1 and 1. At a bound it is the
+        probability of all draws beyond, see
+        :meth:`~giril_rl.networks.distributions.DiagonalGaussian.clamped_log_prob`: the density
+        there would tell a policy far outside from one that plays the very same bound.
+
+        Args:
+            observation: raw observations ``(*batch, observation_size)``, where the weights are.
+            action: of any policy, such as the demonstration's; clamped to the bounds.
+        """
+        distribution = self.distribution(self.normaliser(observation))
+        bounds = self.bounds
+        if bounds is None or not isinstance(distribution, DiagonalGaussian):
+            return distribution.log_prob(action)
+        low, high = action <= bounds.low, action >= bounds.high
+        draw = bounds.inverse(torch.clamp(action, bounds.low, bounds.high))
+        return distribution.clamped_log_prob(draw, low, high)
 
     def update_normaliser(self, observation: Tensor) -> None:
         """Merges raw observations into the running statistics, if there are any."""

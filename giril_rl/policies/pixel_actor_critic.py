@@ -95,6 +95,11 @@ class PixelActorCritic(PPOAgent):
         return action, distribution.log_prob(action), value
 
     @torch.no_grad()
+    def log_prob(self, observation: Tensor, action: Tensor) -> Tensor:
+        """Log-probability ``(*batch,)`` of actions of any policy, for uint8 frames."""
+        return self.distribution_of(self.hidden(observation)).log_prob(action)
+
+    @torch.no_grad()
     def prepare(self, batch: TensorDictBase, following: Tensor) -> None:
         """Writes the value of each next observation, and the frames as the loss reads them.
 

@@ -30,6 +30,7 @@ from giril_rl.rewards.curiosity import (
 )
 from giril_rl.rewards.discriminator import (
     AdversarialConfig,
+    DiscriminatorConfig,
     DiscriminatorLoss,
     DiscriminatorReward,
     DiscriminatorScaling,
@@ -71,6 +72,7 @@ __all__ = [
     "CuriosityConfig",
     "CuriosityReward",
     "CuriosityRewardLoss",
+    "DiscriminatorConfig",
     "DiscriminatorLoss",
     "DiscriminatorReward",
     "DiscriminatorScaling",

@@ -78,6 +78,25 @@ def adversarial_reward(logit: Tensor, form: RewardForm) -> Tensor:
     raise UserError(f"form={form!r} is unknown: choose one of {', '.join(get_args(RewardForm))}.")
 
 
+def with_absorbing(mean: Tensor, absorbing: Tensor, rate: Tensor) -> Tensor:
+    """A set's mean with its absorbing pairs: ``(mean + rate * absorbing) / (1 + rate)``.
+
+    All absorbing pairs are the same one, so a set's mean over ordinary and absorbing pairs needs
+    its value once (Kostrikov et al. 2019, arXiv 1809.02925, section 4.1).
+
+    Args:
+        mean: mean over the ordinary pairs.
+        absorbing: the absorbing pair's value.
+        rate: absorbing pairs for each ordinary one; one enters with each failure.
+
+    Examples:
+        >>> ordinary = torch.tensor([1.0, 2.0, 3.0, 6.0])  # Two of four end in a failure, worth 9.
+        >>> with_absorbing(ordinary.mean(), torch.tensor(9.0), torch.tensor(0.5))
+        tensor(5.)
+    """
+    return (mean + rate * absorbing) / (1 + rate)
+
+
 def interpolated(expert: Tensor, policy: Tensor, weight: Tensor) -> Tensor:
     """Points between pairs of the two sets: ``weight * expert + (1 - weight) * policy``.
 

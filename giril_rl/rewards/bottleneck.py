@@ -7,7 +7,7 @@ information in z, by :func:`~giril_rl.rewards.adversarial.dual_step`.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -19,7 +19,7 @@ from torchrl.envs import EnvBase
 
 from giril_rl.config.schema import knob
 from giril_rl.errors import UserError
-from giril_rl.networks.pixels import PixelBottleneck
+from giril_rl.networks.pixels import SIDE, PixelBottleneck
 from giril_rl.networks.vectors import mlp
 from giril_rl.rewards.actions import ActionEncoder
 from giril_rl.rewards.adversarial import RewardForm, dual_step
@@ -28,6 +28,7 @@ from giril_rl.rewards.discriminator import (
     DiscriminatorLoss,
     DiscriminatorReward,
     DiscriminatorScaling,
+    Sets,
     discriminator_scaler,
 )
 from giril_rl.rewards.generative import gaussian_kl
@@ -84,6 +85,7 @@ class BottleneckReward(DiscriminatorReward):
         form: RewardForm = "positive",
         normalise: DiscriminatorScaling = "standardise",
         clamp: float | None = 10.0,
+        absorbing: bool = False,
         use_actions: bool = True,
         seed: int = 0,
         in_keys: Sequence[NestedKey] = PAIR_KEYS,
@@ -97,7 +99,7 @@ class BottleneckReward(DiscriminatorReward):
         """
         actions = ActionEncoder(action_spec, use_actions=use_actions)
         with seeded(seed):
-            encoder = mlp(observation_dim + actions.size, 2 * latent, hidden)
+            encoder = mlp(observation_dim + actions.size + absorbing, 2 * latent, hidden)
             head = nn.Linear(latent, 1)
         return cls(
             encoder,
@@ -105,6 +107,7 @@ class BottleneckReward(DiscriminatorReward):
             scaler=discriminator_scaler(observation_dim, normalise, clamp),
             actions=actions,
             form=form,
+            absorbing=(observation_dim,) if absorbing else None,
             in_keys=in_keys,
             out_keys=out_keys,
         )
@@ -117,6 +120,7 @@ class BottleneckReward(DiscriminatorReward):
         *,
         channels: int = 4,
         form: RewardForm = "positive",
+        absorbing: bool = False,
         use_actions: bool = True,
         seed: int = 0,
         in_keys: Sequence[NestedKey] = PAIR_KEYS,
@@ -126,7 +130,7 @@ class BottleneckReward(DiscriminatorReward):
         """The paper's encoder for ``channels`` frames of 84x84; see `for_vectors`."""
         actions = ActionEncoder(action_spec, use_actions=use_actions)
         with seeded(seed):
-            encoder = PixelBottleneck(actions.size, latent, channels)
+            encoder = PixelBottleneck(actions.size + absorbing, latent, channels)
             head = nn.Linear(latent, 1)
         return cls(
             encoder,
@@ -134,6 +138,7 @@ class BottleneckReward(DiscriminatorReward):
             scaler=PixelScaler(),
             actions=actions,
             form=form,
+            absorbing=(channels, SIDE, SIDE) if absorbing else None,
             in_keys=in_keys,
             out_keys=out_keys,
         )
@@ -231,12 +236,12 @@ class BottleneckLoss(DiscriminatorLoss):
         return {"beta": self.beta.item()}
 
     def _judge(
-        self, observation: Tensor, encoding: Tensor, experts: int
+        self, observation: Tensor, encoding: Tensor, sets: Sets
     ) -> tuple[Tensor, dict[str, Tensor]]:
         mu, logvar = self.reward.encode(observation, encoding)
         z = mu + (0.5 * logvar).exp() * torch.randn_like(mu)
-        divergence = gaussian_kl(mu, logvar)
-        kl = (divergence[:experts].mean() + divergence[experts:].mean()) / 2
+        expert, policy = sets.means(gaussian_kl(mu, logvar))
+        kl = (expert + policy) / 2
         bottleneck = self.beta * (kl - self.information)
         return self.reward.judge(z), {"loss_bottleneck": bottleneck, "kl": kl.detach()}
 
@@ -245,10 +250,9 @@ def bottleneck_reward(
     settings: BottleneckConfig, env: EnvBase, pairs: TensorDictBase, *, seed: int
 ) -> BottleneckReward:
     """VAIL's reward; arguments as :func:`~giril_rl.rewards.discriminator_reward` has them."""
-    own = "hidden normalise clamp"
-    reward = reward_for(
-        env, BottleneckReward, settings, seed=seed, of_all="form latent use_actions", of_vectors=own
-    )
+    settings = replace(settings, absorbing=bool(settings.absorbing))
+    shared, own = "form absorbing use_actions latent", "hidden normalise clamp"
+    reward = reward_for(env, BottleneckReward, settings, seed=seed, of_all=shared, of_vectors=own)
     reward.fit_scaler(pairs.get("observation"))
     return reward
 

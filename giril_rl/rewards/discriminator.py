@@ -7,13 +7,15 @@ Labels, forms of the reward and the gradient penalty are pure functions in
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Literal, get_args
+from dataclasses import dataclass, replace
+from typing import Any, Literal, NamedTuple, Self, get_args
 
 import torch
+import torch.nn.functional as F
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import dispatch
+from tensordict.nn import TensorDictModuleBase, dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.data import TensorSpec
@@ -22,7 +24,7 @@ from torchrl.envs import EnvBase
 from giril_rl.config.schema import COMPILE, USE_ACTIONS, knob
 from giril_rl.errors import UserError
 from giril_rl.networks.normalise import RunningNormaliser, running_statistics
-from giril_rl.networks.pixels import PixelDiscriminator
+from giril_rl.networks.pixels import SIDE, PixelDiscriminator
 from giril_rl.networks.vectors import mlp
 from giril_rl.rewards.actions import ActionEncoder
 from giril_rl.rewards.adversarial import (
@@ -31,6 +33,7 @@ from giril_rl.rewards.adversarial import (
     discriminator_loss,
     gradient_penalty,
     interpolated,
+    with_absorbing,
 )
 from giril_rl.rewards.fitting import RewardLoss
 from giril_rl.rewards.method import GREEN, Method, register
@@ -38,6 +41,7 @@ from giril_rl.rewards.scaler import ObservationScaler, PixelScaler
 from giril_rl.rewards.transitions import (
     PAIR_KEYS,
     REWARD_KEYS,
+    TERMINATED,
     TransitionReward,
     check_actions,
     check_output,
@@ -52,16 +56,14 @@ DiscriminatorScaling = Literal["running", "demo_range", "standardise", "raw"]
 
 
 @dataclass
-class AdversarialConfig:
-    """GAIL's discriminator, its training and the reward made of it."""
+class DiscriminatorConfig:
+    """A discriminator of vectors or frames, and its training beside the policy."""
 
-    form: str = knob(
-        "positive",
-        "reward of D = P(expert): positive -log(1-D), negative log D, log_ratio, reversed -log D",
-        choices=("positive", "negative", "log_ratio", "reversed"),
-    )
     lr: float = knob(1e-3, "Adam step size (paper: 1e-3)", low=0, low_open=True)
-    updates: int = knob(10, "gradient steps with each batch of PPO", low=1)
+    updates: int = knob(10, "gradient steps with each batch of PPO; off-policy see `every`", low=1)
+    every: int = knob(
+        20, "off-policy: environment steps that `updates` gradient steps go to", low=1
+    )
     batch: int = knob(250, "most pairs of expert and of policy in each gradient step", low=1)
     penalty: float = knob(1.0, "weight of the gradient penalty; 0 leaves it out", low=0)
     normalise: str = knob(
@@ -73,9 +75,48 @@ class AdversarialConfig:
         10.0, "bound on normalised observations; null has none", low=0, low_open=True
     )
     hidden: list[int] = knob([100, 100], "hidden layers of the discriminator (tanh)", low=1)
-    use_actions: bool = knob(True, USE_ACTIONS)
     seed: int | None = knob(None, "seed of the discriminator; null takes the run's seed", low=0)
     compile: bool = knob(False, COMPILE)
+
+
+@dataclass
+class AdversarialConfig(DiscriminatorConfig):
+    """GAIL's discriminator, its training and the reward made of it."""
+
+    form: str = knob(
+        "positive",
+        "reward of D = P(expert): positive -log(1-D), negative log D, log_ratio, reversed -log D",
+        choices=("positive", "negative", "log_ratio", "reversed"),
+    )
+    use_actions: bool = knob(True, USE_ACTIONS)
+    absorbing: bool | None = knob(
+        None, "a failure leads to an absorbing state, which is rewarded too; null: off-policy only"
+    )
+
+    def check(self, prefix: str, run: object) -> None:
+        """Refuses two rules for what follows a failure."""
+        if self.absorbing and getattr(run, "termination", "ends") == "bootstrap":
+            raise UserError(
+                f"{prefix}absorbing=true says what follows a failure, and termination=bootstrap "
+                "that its last state's value does: leave one of them out."
+            )
+
+    def settled(self, run: object) -> Self:
+        """These settings with ``absorbing`` as the run's learner needs it, where it is null.
+
+        Args:
+            run: the run's settings, of which the learner and what follows a failure are read.
+
+        Examples:
+            >>> from giril_rl.config.schema import RewardRunConfig
+            >>> AdversarialConfig().settled(RewardRunConfig()).absorbing
+            False
+        """
+        if self.absorbing is not None:
+            return self
+        off_policy = getattr(run, "algorithm", "ppo") != "ppo"
+        ends = getattr(run, "termination", "ends") == "ends"
+        return replace(self, absorbing=off_policy and ends)
 
 
 class DiscriminatorReward(Pretrained, TransitionReward):
@@ -93,6 +134,8 @@ class DiscriminatorReward(Pretrained, TransitionReward):
             observations'.
         actions: encodes actions.
         form: the reward's form.
+        absorbing: the shape of one scaled observation, where absorbing states are judged too;
+            ``network`` then gets one more entry of the encoding. None judges none.
         in_keys: keys of observation and action.
         out_keys: where the reward is written, one key.
 
@@ -116,6 +159,7 @@ class DiscriminatorReward(Pretrained, TransitionReward):
         scaler: nn.Module,
         actions: ActionEncoder,
         form: RewardForm = "positive",
+        absorbing: Sequence[int] | None = None,
         in_keys: Sequence[NestedKey] = PAIR_KEYS,
         out_keys: Sequence[NestedKey] = REWARD_KEYS,
     ) -> None:
@@ -125,6 +169,7 @@ class DiscriminatorReward(Pretrained, TransitionReward):
         self.network = network
         self.scaler = scaler
         self.form: RewardForm = form
+        self.absorbing = None if absorbing is None else tuple(absorbing)
 
     @classmethod
     @remembered
@@ -137,6 +182,7 @@ class DiscriminatorReward(Pretrained, TransitionReward):
         form: RewardForm = "positive",
         normalise: DiscriminatorScaling = "standardise",
         clamp: float | None = 10.0,
+        absorbing: bool = False,
         use_actions: bool = True,
         seed: int = 0,
         in_keys: Sequence[NestedKey] = PAIR_KEYS,
@@ -151,6 +197,7 @@ class DiscriminatorReward(Pretrained, TransitionReward):
             form: the reward's form.
             normalise: the observation's rule, see :func:`discriminator_scaler`.
             clamp: bound on each scaled observation; None has none.
+            absorbing: whether absorbing states are judged too.
             use_actions: False reads observations alone, see :class:`ActionEncoder`.
             seed: seed of the weights. The global random state stays as it is.
             in_keys: see the class.
@@ -161,12 +208,13 @@ class DiscriminatorReward(Pretrained, TransitionReward):
         """
         actions = ActionEncoder(action_spec, use_actions=use_actions)
         with seeded(seed):
-            network = mlp(observation_dim + actions.size, 1, hidden)
+            network = mlp(observation_dim + actions.size + absorbing, 1, hidden)
         return cls(
             network,
             scaler=discriminator_scaler(observation_dim, normalise, clamp),
             actions=actions,
             form=form,
+            absorbing=(observation_dim,) if absorbing else None,
             in_keys=in_keys,
             out_keys=out_keys,
         )
@@ -179,6 +227,7 @@ class DiscriminatorReward(Pretrained, TransitionReward):
         *,
         channels: int = 4,
         form: RewardForm = "positive",
+        absorbing: bool = False,
         use_actions: bool = True,
         seed: int = 0,
         in_keys: Sequence[NestedKey] = PAIR_KEYS,
@@ -187,12 +236,13 @@ class DiscriminatorReward(Pretrained, TransitionReward):
         """The paper's network for ``channels`` frames of 84x84; see `for_vectors`."""
         actions = ActionEncoder(action_spec, use_actions=use_actions)
         with seeded(seed):
-            network = PixelDiscriminator(actions.size, channels=channels)
+            network = PixelDiscriminator(actions.size + absorbing, channels=channels)
         return cls(
             network,
             scaler=PixelScaler(),
             actions=actions,
             form=form,
+            absorbing=(channels, SIDE, SIDE) if absorbing else None,
             in_keys=in_keys,
             out_keys=out_keys,
         )
@@ -208,10 +258,46 @@ class DiscriminatorReward(Pretrained, TransitionReward):
             self.scaler.update(observations)
 
     def inputs(self, observation: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
-        """The scaled observation and the encoded action, whose shapes are checked."""
+        """The scaled observation and the encoded action, whose shapes are checked.
+
+        Where absorbing states are judged, a last entry of the encoding is 0: not absorbing.
+        """
         if (event_dims := getattr(self.scaler, "event_dims", None)) is not None:
             check_actions(self.actions, action, observation, event_dims)
-        return self.scaler(observation), self.actions(action)
+        encoding = self.actions(action)
+        if self.absorbing is not None:
+            encoding = F.pad(encoding, (0, 1))
+        return self.scaler(observation), encoding
+
+    def absorbing_inputs(self) -> tuple[Tensor, Tensor]:
+        """The absorbing pair, a batch of one: all zeros, and a last entry of 1 in the encoding."""
+        if self.absorbing is None:
+            raise UserError(
+                "this reward judges no absorbing states: build it with absorbing=True, "
+                "reward.absorbing=true of a recipe."
+            )
+        device = next(self.network.parameters()).device
+        observation = torch.zeros(1, *self.absorbing, device=device)
+        encoding = torch.zeros(1, self.actions.size, device=device)
+        return observation, F.pad(encoding, (0, 1), value=1.0)
+
+    @torch.no_grad()
+    def absorbing_reward(self) -> Tensor:
+        """The reward of each step in the absorbing state, a scalar.
+
+        Raises:
+            UserError: if the reward was built without absorbing states.
+
+        Examples:
+            >>> from torchrl.data import Categorical
+            >>> spec = Categorical(3)
+            >>> DiscriminatorReward.for_vectors(2, spec, absorbing=True).absorbing_reward().shape
+            torch.Size([])
+        """
+        inputs = self.absorbing_inputs()
+        with running_statistics(self):
+            logit = self.logit(*inputs)
+        return adversarial_reward(logit, self.form).squeeze(0)
 
     def logit(self, observation: Tensor, encoding: Tensor) -> Tensor:
         """The logit ``(*batch,)`` of a scaled observation and an encoded action."""
@@ -261,7 +347,66 @@ def discriminator_scaler(
     )
 
 
-class DiscriminatorLoss(RewardLoss):
+class AdversarialLoss(RewardLoss):
+    """The loss of a discriminator between an expert's transitions and a policy's.
+
+    A subclass names what it reads in ``in_keys`` and ``transition_keys``, and computes in
+    ``_terms``. There is no ``reduction``: each term is a mean over its own set.
+
+    Args:
+        reward: the module to train; its parameters are this loss's parameters.
+        penalty: weight of the gradient penalty; 0 leaves it out.
+        functional: see :class:`~giril_rl.rewards.TransitionLoss`.
+
+    Raises:
+        UserError: for a negative penalty.
+    """
+
+    reward: Any
+
+    def __init__(
+        self, reward: TensorDictModuleBase, *, penalty: float = 0.0, functional: bool = False
+    ) -> None:
+        if not penalty >= 0:
+            raise UserError(f"penalty={penalty} is negative: give a weight of 0 or more.")
+        super().__init__(reward, functional=functional)
+        self.penalty = penalty
+
+    @property
+    @abstractmethod
+    def transition_keys(self) -> list[NestedKey]:
+        """What is read of a set of transitions, by its keys in a batch."""
+
+    @property
+    def out_keys(self) -> list[NestedKey]:
+        """Names of the terms to be added, ``loss_*``, and of what is logged."""
+        penalty = ["loss_penalty"] if self.penalty else []
+        return ["loss_expert", "loss_policy", *penalty, *self.log_keys]
+
+    @property
+    def log_keys(self) -> list[str]:
+        """Names of what is logged."""
+        return ["accuracy_expert", "accuracy_policy"]
+
+    def after_step(self, log: Mapping[str, Tensor]) -> None:
+        """Follows each gradient step; ``log`` has the step's :attr:`log_keys`."""
+
+    def logged_state(self) -> dict[str, float]:
+        """Numbers of the loss's own that are worth logging."""
+        return {}
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """The terms and what is logged, all scalars."""
+        with self.parameters_in_reward():
+            return self._terms(tensordict)
+
+    @abstractmethod
+    def _terms(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """All :attr:`out_keys`."""
+
+
+class DiscriminatorLoss(AdversarialLoss):
     """GAIL's binary cross-entropy on logits, with an optional gradient penalty.
 
     - ``loss_expert`` and ``loss_policy``: the two terms of
@@ -272,10 +417,14 @@ class DiscriminatorLoss(RewardLoss):
 
     Their sum is to be minimised. ``accuracy_expert`` and ``accuracy_policy`` are logged besides.
 
+    Where the reward judges absorbing states, each set has ``("next", "terminated")`` too, whose
+    mean is its number of absorbing pairs for each ordinary one. They count in both terms, by
+    :func:`~giril_rl.rewards.adversarial.with_absorbing`, and the penalty has two more points: one
+    between the absorbing pair and the policy's first, one between the expert's and it.
+
     The two sets are usually under ``"expert"`` and ``"policy"``, each of any leading shape. Their
     shapes may differ; the TensorDict that holds both then has no batch dimension. Without penalty
     and for equal sizes the loss is that of TorchRL's ``GAILLoss``, which expects probabilities.
-    There is no ``reduction``: each term is a mean over its own set.
 
     Args:
         reward: the module to train; its parameters are this loss's parameters.
@@ -306,6 +455,8 @@ class DiscriminatorLoss(RewardLoss):
         expert_action: NestedKey = ("expert", "action")
         policy_observation: NestedKey = ("policy", "observation")
         policy_action: NestedKey = ("policy", "action")
+        expert_terminated: NestedKey = ("expert", "next", "terminated")
+        policy_terminated: NestedKey = ("policy", "next", "terminated")
 
     default_keys = _AcceptedKeys
     tensor_keys: _AcceptedKeys
@@ -314,11 +465,10 @@ class DiscriminatorLoss(RewardLoss):
     def __init__(
         self, reward: DiscriminatorReward, *, penalty: float = 0.0, functional: bool = False
     ) -> None:
-        if not penalty >= 0:
-            raise UserError(f"penalty={penalty} is negative: give a weight of 0 or more.")
-        super().__init__(reward, functional=functional)
-        self.penalty = penalty
+        super().__init__(reward, penalty=penalty, functional=functional)
         entries = dict(zip(("observation", "action"), reward.in_keys, strict=False))
+        if reward.absorbing is not None:
+            entries["terminated"] = TERMINATED
         keys = {
             f"{side}_{entry}": (side, *(key if isinstance(key, tuple) else (key,)))
             for side in ("expert", "policy")
@@ -329,46 +479,42 @@ class DiscriminatorLoss(RewardLoss):
 
     @property
     def in_keys(self) -> list[NestedKey]:
-        """Keys of the expert's observation and action and of the policy's."""
+        """Keys of the expert's set, then of the policy's: observation, action, perhaps the end."""
         return [getattr(self.tensor_keys, entry) for entry in self._entries]
 
     @property
-    def out_keys(self) -> list[NestedKey]:
-        """Names of the terms to be added, ``loss_*``, and of what is logged."""
-        penalty = ["loss_penalty"] if self.penalty else []
-        return ["loss_expert", "loss_policy", *penalty, *self.log_keys]
-
-    @property
-    def log_keys(self) -> list[str]:
-        """Names of what is logged."""
-        return ["accuracy_expert", "accuracy_policy"]
-
-    def after_step(self, log: Mapping[str, Tensor]) -> None:
-        """Follows each gradient step; ``log`` has the step's :attr:`log_keys`."""
-
-    def logged_state(self) -> dict[str, float]:
-        """Numbers of the loss's own that are worth logging."""
-        return {}
-
-    @dispatch
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """The terms and what is logged, all scalars."""
-        with self.parameters_in_reward():
-            return self._terms(tensordict)
+    def transition_keys(self) -> list[NestedKey]:
+        """What is read of a set of transitions, by its keys in a batch."""
+        ends = [] if self.reward.absorbing is None else [TERMINATED]
+        return [*self.reward.in_keys, *ends]
 
     def _terms(self, tensordict: TensorDictBase) -> TensorDictBase:
         entries = read(tensordict, self.in_keys)
         half = len(entries) // 2
+        read_of = len(self.reward.in_keys)
         expert, policy = (
-            _flat(name, *self.reward.inputs(*with_action(self.reward, pairs)))
+            _flat(name, *self.reward.inputs(*with_action(self.reward, pairs[:read_of])))
             for name, pairs in (("expert", entries[:half]), ("policy", entries[half:]))
         )
+        sets = Sets(len(expert[0]), len(policy[0]))
+        parts = [expert, policy]
+        if self.reward.absorbing is not None:
+            parts.append(self.reward.absorbing_inputs())
+            rates = (entries[half - 1].float().mean(), entries[-1].float().mean())
+            sets = sets._replace(rates=rates)
         # One pass for both sets.
-        observation, encoding = (torch.cat(sets) for sets in zip(expert, policy, strict=True))
-        logit, out = self._judge(observation, encoding, len(expert[0]))
-        logits = logit[: len(expert[0])], logit[len(expert[0]) :]
+        observation, encoding = (torch.cat(rows) for rows in zip(*parts, strict=True))
+        logit, out = self._judge(observation, encoding, sets)
+        logits = sets.ordinary(logit)
         out["loss_expert"], out["loss_policy"] = discriminator_loss(*logits)
+        if sets.rates is not None:
+            ends = discriminator_loss(logit[-1:], logit[-1:])
+            for name, end, rate in zip(("expert", "policy"), ends, sets.rates, strict=True):
+                out[f"loss_{name}"] = with_absorbing(out[f"loss_{name}"], end, rate)
         if self.penalty:
+            if sets.rates is not None:
+                expert = _joined(parts[2], expert)
+                policy = _joined(policy, parts[2])
             weight = torch.rand(max(len(expert[0]), len(policy[0])), device=logit.device)
             points = [interpolated(e, p, weight) for e, p in zip(expert, policy, strict=True)]
             # With the batch's own statistics each sample's gradient would depend on all samples.
@@ -379,10 +525,45 @@ class DiscriminatorLoss(RewardLoss):
         return TensorDict({str(key): out[str(key)] for key in self.out_keys})
 
     def _judge(
-        self, observation: Tensor, encoding: Tensor, experts: int
+        self, observation: Tensor, encoding: Tensor, sets: Sets
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        """The logits of both sets, of which the first ``experts`` are the expert's."""
+        """The logit of each row, and what else the loss has."""
         return self.reward.logit(observation, encoding), {}
+
+
+class Sets(NamedTuple):
+    """Which rows of a batch are whose: first the expert's, then the policy's, then the absorbing.
+
+    Attributes:
+        experts: number of the expert's rows.
+        policies: number of the policy's.
+        rates: absorbing pairs for each ordinary one of the expert and of the policy; None where
+            there is no absorbing row.
+    """
+
+    experts: int
+    policies: int
+    rates: tuple[Tensor, Tensor] | None = None
+
+    def ordinary(self, values: Tensor) -> tuple[Tensor, Tensor]:
+        """The expert's rows and the policy's."""
+        return values[: self.experts], values[self.experts : self.experts + self.policies]
+
+    def means(self, values: Tensor) -> tuple[Tensor, Tensor]:
+        """Means over the expert's pairs and over the policy's, the absorbing ones included."""
+        expert, policy = (rows.mean() for rows in self.ordinary(values))
+        if self.rates is None:
+            return expert, policy
+        absorbing = values[-1]
+        rates = self.rates
+        return with_absorbing(expert, absorbing, rates[0]), with_absorbing(
+            policy, absorbing, rates[1]
+        )
+
+
+def _joined(*sets: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+    observation, encoding = (torch.cat(rows) for rows in zip(*sets, strict=True))
+    return observation, encoding
 
 
 def _flat(name: str, observation: Tensor, encoding: Tensor) -> tuple[Tensor, Tensor]:
@@ -407,9 +588,10 @@ def discriminator_reward(
         pairs: the demonstrated transitions to learn from.
         seed: seed of the weights. The global random state stays as it is.
     """
-    own = "hidden normalise clamp"
+    settings = replace(settings, absorbing=bool(settings.absorbing))
+    shared, own = "form absorbing use_actions", "hidden normalise clamp"
     reward = reward_for(
-        env, DiscriminatorReward, settings, seed=seed, of_all="form use_actions", of_vectors=own
+        env, DiscriminatorReward, settings, seed=seed, of_all=shared, of_vectors=own
     )
     reward.fit_scaler(pairs.get("observation"))
     return reward

@@ -20,6 +20,7 @@ from giril_rl.runs.randomness import stream_seed
 TRANSITION_KEYS: tuple[NestedKey, ...] = ("observation", "action", ("next", "observation"))
 PAIR_KEYS: tuple[NestedKey, ...] = ("observation", "action")
 STATE_KEYS: tuple[NestedKey, ...] = ("observation", ("next", "observation"))
+TERMINATED: NestedKey = ("next", "terminated")
 REWARD_KEYS: tuple[NestedKey, ...] = (("next", "intrinsic_reward"),)
 PIXELS_AT_ONCE = 256
 """Transitions of frames that a network takes at a time."""
@@ -70,7 +71,7 @@ class TransitionReward(TensorDictModuleBase):
     ) -> None:
         super().__init__()
         if len(in_keys) != len(roles) or len(out_keys) != 1:
-            number = {1: "one", 2: "two", 3: "three"}[len(roles)]
+            number = {1: "one", 2: "two", 3: "three", 4: "four"}[len(roles)]
             raise UserError(
                 f"{what} has {number} in_keys ({', '.join(roles)}) and one out_key, not "
                 f"{list(in_keys)} and {list(out_keys)}."

@@ -48,6 +48,8 @@ ADDED = {
     "ppo.clip_value": False,
     "demo.lives": "first",
     "clip_reward": False,
+    "reward.absorbing": None,
+    "reward.every": 20,
     "held_episodes": 20,
     "demo.first": None,
     **dict.fromkeys(("reward.use_actions", "giril.use_actions", "icm.use_actions"), True),

@@ -19,7 +19,12 @@ from giril_rl.training.loop import Trained, train_policy
 from giril_rl.training.own_visits import VisitTrainer
 from giril_rl.training.ppo import PPO, return_scaling
 from giril_rl.training.result import finish_run
-from giril_rl.training.reward_trainers import AdversarialTrainer, RewardTrainer
+from giril_rl.training.reward_trainers import (
+    AdversarialTrainer,
+    RewardTrainer,
+    absorbing_value,
+    terminal_rate,
+)
 from giril_rl.training.sac import SAC
 from giril_rl.training.scoring import Scores, evaluate, evaluate_both
 
@@ -36,6 +41,7 @@ __all__ = [
     "Scores",
     "Trained",
     "VisitTrainer",
+    "absorbing_value",
     "check_discrete",
     "check_inputs",
     "check_task",
@@ -51,6 +57,7 @@ __all__ = [
     "obtain_demonstration",
     "open_run",
     "return_scaling",
+    "terminal_rate",
     "train_expert",
     "train_policy",
 ]

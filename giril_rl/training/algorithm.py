@@ -7,7 +7,7 @@ from typing import Any, Protocol, cast
 
 import torch
 from tensordict import TensorDictBase
-from torch import Tensor, nn
+from torch import nn
 
 from giril_rl.config.schema import DemoRunConfig, RunConfig, ScalingConfig
 from giril_rl.demos import Demonstration, subsample
@@ -86,7 +86,6 @@ def make_algorithm(
     transform: nn.Module | None = None,
     moving: bool = False,
     demonstration_reward: float | None = None,
-    absorbing: Callable[[], Tensor] | None = None,
     use: Use = "training",
 ) -> PPO | SAC:
     """The algorithm that ``cfg.algorithm`` names, with an untrained agent for ``env``.
@@ -101,7 +100,6 @@ def make_algorithm(
             anew for each minibatch.
         demonstration_reward: the reward of each demonstrated transition in SAC's replay buffer;
             None lets ``transform`` compute it.
-        absorbing: see :class:`~giril_rl.training.sac.SAC`.
         use: what the random numbers are for.
 
     Raises:
@@ -127,7 +125,6 @@ def make_algorithm(
         relabel_episodes=_of_whole_episodes(transform),
         scaling=_scaling(scaling, cfg.sac.gamma) if isinstance(scaling, ScalingConfig) else None,
         termination=termination,
-        absorbing=absorbing,
     )
 
 

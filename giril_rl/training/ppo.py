@@ -62,6 +62,8 @@ class PPO:
     """
 
     name = "ppo"
+    own: None = None
+    """PPO keeps no transitions: a reward that learns beside it takes the batch collected last."""
 
     def __init__(
         self, agent: PPOAgent, cfg: PPOConfig, *, steps: int, termination: str = "ends"

@@ -81,6 +81,12 @@ class Replay:
         self._buffer.extend(rows)
         self.written += len(rows)
 
+    def own(self, count: int) -> TensorDictBase:
+        """Draws ``count`` of the agent's own transitions alone, see :meth:`sample`."""
+        if self._buffer is None or not self.written:
+            raise ValueError("nothing was stored yet")
+        return self._buffer.sample(count).select(*self.keys)
+
     def sample(self, count: int, *, minibatch: int | None = None) -> TensorDictBase:
         """Draws ``count`` transitions with torch's global generator, a new flat batch.
 
@@ -90,10 +96,7 @@ class Replay:
                 ``share`` of the demonstration.
         """
         demonstrated = self._where_demonstrated(count, minibatch or count)
-        if self._buffer is None or not self.written:
-            raise ValueError("nothing was stored yet")
-        drawn = self._buffer.sample(count)
-        drawn = drawn.select(*self.keys)
+        drawn = self.own(count)
         if demonstrated is not None and len(demonstrated):
             assert self._demonstration is not None
             rows = torch.randint(len(self._demonstration), demonstrated.shape)

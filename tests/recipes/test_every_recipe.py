@@ -48,6 +48,8 @@ EXTRA = {
     "cdil": CDIL,
     "gail": ADVERSARIAL,
     "vail": ADVERSARIAL,
+    "airl": ADVERSARIAL,
+    "ilde": [word for word in CDIL if "reward" not in word],
     "expert": ["stop_early=false"],
     "control": [],
 }
@@ -103,7 +105,7 @@ def assert_whole(folder, result, recipe, task, steps):
         assert len(scores["returns"]) == scores["episodes"] == 2
         assert scores["return_mean"] == pytest.approx(sum(scores["returns"]) / 2)
         assert scores["episode_length_mean"] >= 1
-    assert (result["fit_seconds"] > 0) == (recipe in ("giril", "cdil"))
+    assert (result["fit_seconds"] > 0) == (recipe in ("giril", "cdil", "ilde"))
     trained = result["wall_seconds"] - result["fit_seconds"]
     assert trained > 0
     speed = steps / trained
@@ -137,7 +139,7 @@ def test_a_recipe_leaves_a_whole_result(recipe, root, tmp_path, capsys):
     if recipe in ("giril", "cdil"):
         fit = [row for row in timeless(tmp_path / "run") if row["phase"] == "fit"]
         assert [row["step"] for row in fit] == [10, 20]
-    if recipe in ("gail", "vail"):
+    if recipe in ("gail", "vail", "airl", "ilde"):
         row = timeless(tmp_path / "run")[-1]
         assert math.isfinite(row["discriminator/loss_expert"])
         assert ("discriminator/beta" in row) == (recipe == "vail")

@@ -206,6 +206,9 @@ def transitions(case: Case, *batch: int, keys: dict = PLAIN, seed: int = 0) -> T
     out = TensorDict(batch_size=batch)
     for name, value in values.items():
         out.set(keys[name], value)
+    # What AIRL reads besides.
+    out.set(("next", "terminated"), torch.zeros(*batch, 1, dtype=torch.bool))
+    out.set("policy_log_prob", torch.zeros(batch))
     return out
 
 

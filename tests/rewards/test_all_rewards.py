@@ -36,6 +36,7 @@ from giril_rl.rewards import (
     ObservationScaler,
     PixelScaler,
 )
+from giril_rl.rewards.airl import AIRLReward
 from giril_rl.rewards.dril import DisagreementReward
 from giril_rl.rewards.method import GREY, Method, register, unregister
 from giril_rl.rewards.mmd import MMDReward
@@ -55,6 +56,10 @@ def of_pixels(cls, *entries, **kwargs):
 
 def copied(c):
     return CopyReward(ObservationScaler(c.dim), **c.reads(*STATES))
+
+
+def airl_of_states(c):
+    return AIRLReward.for_vectors(c.dim, c.spec, state_only=True, seed=c.seed, out_keys=c.out_keys)
 
 
 def copied_pixels(c):
@@ -96,6 +101,9 @@ VARIANTS = [
     Case("gail-min-max-log_ratio", GAIL(normalise="demo_range", form="log_ratio"), "discrete"),
     Case("gail-raw-reversed", GAIL(normalise="raw", form="reversed")),
     Case("vail-running-reversed", VAIL(normalise="running", form="reversed"), "discrete"),
+    Case("gail-absorbing", GAIL(absorbing=True)),
+    Case("vail-absorbing-pixels", of_pixels(BottleneckReward, *PAIR, absorbing=True), "pixels"),
+    Case("airl-state-only", airl_of_states, "box", STATES, takes_keys=False),
     Case("giril-states", GIRIL(use_actions=False), depends_on=STATES, deterministic=False),
     Case("icm-states", of_vectors(CuriosityReward, use_actions=False), "discrete"),
     Case("gail-states", GAIL(use_actions=False)),

@@ -71,7 +71,7 @@ def test_later_keys_count_where_they_change_something():
 
 
 def test_the_value_of_a_later_key_is_its_default():
-    kinds = (ExpertRunConfig, ControlRunConfig, Fitted)
+    kinds = (ExpertRunConfig, ControlRunConfig, Fitted, Adversarial)
     defaults = {knob.key for kind in kinds for knob in knobs(kind)}
     assert set(ADDED) <= defaults
     assert without_added(asdict(ExpertRunConfig(task=TASK))).get("termination") is None

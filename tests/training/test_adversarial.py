@@ -3,6 +3,7 @@
 import gymnasium
 import pytest
 import torch
+from random_pairs import assert_equal, pairs
 from short_runs import Garbage, Killed, rows, stopped
 from tensordict import TensorDict
 from torchrl.data import Bounded, Categorical
@@ -30,16 +31,6 @@ SPECS = {"box": Bounded(-1.0, 1.0, shape=(4, 1)), "discrete": Categorical(2, sha
 METHODS = ("gail", "vail")
 
 
-def pairs(*shape, kind="box", shift=0.0, dim=3, seed=0):
-    generator = torch.Generator().manual_seed(seed)
-    observation = torch.randn(*shape, dim, generator=generator) + shift
-    if kind == "discrete":
-        action = torch.randint(2, shape, generator=generator)
-    else:
-        action = 2 * torch.rand(*shape, 1, generator=generator) - 1
-    return TensorDict({"observation": observation, "action": action}, shape)
-
-
 def make(method="gail", *, spec=SPECS["box"], expert=None, seed=0, dim=3, **kwargs):
     """A learner and its reward."""
     cfg = AdversarialConfig(**{"updates": 3, "batch": 32, "lr": 1e-2, "penalty": 0.0, **kwargs})
@@ -51,23 +42,6 @@ def make(method="gail", *, spec=SPECS["box"], expert=None, seed=0, dim=3, **kwar
         loss = BottleneckLoss(reward, penalty=cfg.penalty, beta_step=0.1, beta=0.5)
     expert = pairs(20, seed=9) if expert is None else expert
     return AdversarialTrainer(loss, expert, cfg, seed=seed), reward
-
-
-def assert_equal(found, expected, path=""):
-    """Nested state, bit for bit."""
-    assert type(found) is type(expected), path
-    if isinstance(found, dict):
-        assert found.keys() == expected.keys(), path
-        for key in found:
-            assert_equal(found[key], expected[key], f"{path}.{key}")
-    elif isinstance(found, list):
-        assert len(found) == len(expected), path
-        for i, (one, other) in enumerate(zip(found, expected, strict=True)):
-            assert_equal(one, other, f"{path}.{i}")
-    elif isinstance(found, torch.Tensor):
-        assert found.dtype == expected.dtype and torch.equal(found, expected), path
-    else:
-        assert found == expected, path
 
 
 @pytest.mark.parametrize("method", METHODS)

@@ -1,0 +1,47 @@
+"""SQIL: constant rewards, 1 for what was demonstrated and 0 for what the agent does itself.
+
+Reddy et al., ICLR 2020, arXiv 1905.11108. There is nothing to train: the learner draws half of each
+minibatch from the demonstration and half from its own transitions.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from tensordict import TensorDictBase
+from torchrl.envs import EnvBase
+
+from giril_rl.config.schema import knob
+from giril_rl.rewards.controls import ConstantReward
+from giril_rl.rewards.method import GREY, Method, register
+
+
+@dataclass
+class SQILConfig:
+    """SQIL's two rewards."""
+
+    demonstration: float = knob(1.0, "reward of the demonstration's transitions (paper: 1)")
+    own: float = knob(0.0, "reward of the agent's own transitions (paper: 0)")
+
+
+def sqil_reward(
+    settings: SQILConfig, env: EnvBase, pairs: TensorDictBase, *, seed: int = 0
+) -> ConstantReward:
+    """The reward of the agent's own transitions; the demonstration's is the learner's to add.
+
+    Args:
+        settings: the two rewards.
+        env: has no effect, for no transition is read.
+        pairs: have no effect.
+        seed: has no effect, for nothing is random.
+
+    Examples:
+        >>> from tensordict import TensorDict
+        >>> reward = sqil_reward(SQILConfig(), env=None, pairs=None)
+        >>> reward(TensorDict(batch_size=[2]))["next", "intrinsic_reward"].flatten()
+        tensor([0., 0.])
+    """
+    return ConstantReward(settings.own)
+
+
+register(Method("sqil", "SQIL", GREY, trained="never", settings=SQILConfig, build=sqil_reward))
