@@ -7,15 +7,24 @@ import pytest
 from short_runs import Killed, rows, weights
 
 from giril_rl.cli.command_line import main
+from giril_rl.config.compose import resolved
+from giril_rl.config.recipes import config_class, find
 from giril_rl.runs.run import Run
 
 SHORT = [
     *("steps=512", "eval.episodes=1", "logger=null", "expert.steps=2000", "demo.length=100"),
-    *("demo.subsample=2", "task.env_id=CartPole-v1", "ppo.num_envs=2", "ppo.rollout=64"),
-    *("ppo.minibatch=64", "ppo.epochs=1", "ppo.hidden=[16,16]", "ppo.checkpoint_every=128"),
-    *("sac.num_envs=2", "sac.rollout=8", "sac.batch=16", "sac.hidden=[16]", "sac.random_steps=64"),
-    *("sac.checkpoint_every=128", "sac.log_every=64"),
+    *("demo.subsample=2", "task.env_id=CartPole-v1"),
 ]
+LEARNERS = {
+    "ppo": [
+        *("ppo.num_envs=2", "ppo.rollout=64", "ppo.minibatch=64", "ppo.epochs=1"),
+        *("ppo.hidden=[16,16]", "ppo.checkpoint_every=128"),
+    ],
+    "sac": [
+        *("sac.num_envs=2", "sac.rollout=8", "sac.batch=16", "sac.hidden=[16]"),
+        *("sac.random_steps=64", "sac.checkpoint_every=128", "sac.log_every=64"),
+    ],
+}
 DRIL = ["fit.steps=20", "fit.log_every=10", "reward.hidden=[16]", "reward.bc_every=50"]
 RECIPES = {
     "nearest": [],
@@ -32,19 +41,16 @@ def root(tmp_path_factory):
     return tmp_path_factory.mktemp("runs")
 
 
-def words(recipe, out, root, *more):
-    by_key = {
-        word.split("=")[0]: word
-        for word in [*SHORT, *RECIPES[recipe], f"out={out}", f"root={root}", *more]
-    }
-    return ["run", recipe, *by_key.values()]
+def words(recipe, out, root, *more, algorithm="sac"):
+    place = [f"out={out}", f"root={root}", f"algorithm={algorithm}"]
+    known = [*SHORT, *LEARNERS[algorithm], *RECIPES[recipe], *place, *more]
+    return ["run", recipe, *{word.split("=")[0]: word for word in known}.values()]
 
 
 @pytest.mark.parametrize("algorithm", ["ppo", "sac"])
 @pytest.mark.parametrize("recipe", RECIPES)
 def test_from_command_to_result_and_resumed_bit_for_bit(recipe, algorithm, root, tmp_path):
-    learner = f"algorithm={algorithm}"
-    assert main(words(recipe, tmp_path / "whole", root, learner)) == 0
+    assert main(words(recipe, tmp_path / "whole", root, algorithm=algorithm)) == 0
     result = json.loads((tmp_path / "whole" / "result.json").read_text())
     assert result["env_steps"] == 512
     found = [row for row in rows(tmp_path / "whole") if row["phase"] == algorithm]
@@ -58,8 +64,8 @@ def test_from_command_to_result_and_resumed_bit_for_bit(recipe, algorithm, root,
             raise Killed
 
     with patch.object(Run, "log", killed):
-        assert main(words(recipe, tmp_path / "killed", root, learner)) == 1
-    assert main(words(recipe, tmp_path / "killed", root, learner)) == 0
+        assert main(words(recipe, tmp_path / "killed", root, algorithm=algorithm)) == 1
+    assert main(words(recipe, tmp_path / "killed", root, algorithm=algorithm)) == 0
     assert weights(tmp_path / "killed") == weights(tmp_path / "whole")
     assert rows(tmp_path / "killed") == rows(tmp_path / "whole")
 
@@ -76,7 +82,8 @@ def test_dril_without_cloning_beside_and_all_transitions(root, tmp_path):
     assert not any("bc/loss" in row for row in rows(tmp_path / "run"))
 
 
-def test_the_default_learner_is_off_policy(root, tmp_path):
-    for recipe in ("nearest", "mmd", "dril"):
-        assert main(words(recipe, tmp_path / recipe, root, "steps=64")) == 0
-        assert any(row["phase"] == "sac" for row in rows(tmp_path / recipe))
+@pytest.mark.parametrize("recipe", ["nearest", "mmd", "dril"])
+def test_the_default_is_off_policy_from_the_whole_demonstration(recipe):
+    found = find(recipe)
+    config, _ = resolved(found, config_class(found), [])
+    assert (config.algorithm, config.demo.subsample) == ("sac", 1)
