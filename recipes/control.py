@@ -49,7 +49,8 @@ def main(cfg: Config, out: Path) -> None:
             *[BatchMeanReward()] * cfg.batch_mean,
             *return_scaling(cfg),
         )
-        learner = make_algorithm(env, cfg, run=run, demo=demo, transform=transform)
+        moving = cfg.method.scope == "batch"  # It depends on the minibatch.
+        learner = make_algorithm(env, cfg, run=run, demo=demo, transform=transform, moving=moving)
         trained = train_policy(env, learner, transform, seed=cfg.seed, run=run)
         finish_run(
             run, cfg, learner.agent, trained, expert=expert, demo=demo, reward=reward, seeds=seeds

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import copy
 import re
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -164,6 +164,7 @@ class Composer:
         composed = self.compose([*words.values(), *seed])
         config = composed.config()
         validate(config)
+        _refuse_unread(config, composed.changes)
         # Most jobs of a sweep differ in their seed alone, which other settings seldom refer to.
         unresolved = str(OmegaConf.to_container(composed.node))
         known = (*words.values(), *(seed if re.search(r"\$\{\.*seed\}", unresolved) else []))
@@ -260,7 +261,20 @@ def resolved(recipe: Recipe, config: type[Any], texts: Sequence[str]) -> tuple[A
     composed = compose(recipe, config, texts)
     built = composed.config()
     validate(built)
+    _refuse_unread(built, composed.changes)
     return built, composed.changes
+
+
+def _refuse_unread(config: Any, changes: Mapping[str, str]) -> None:
+    """Refuses the user's settings of the algorithm that does not run."""
+    algorithm = getattr(config, "algorithm", None)
+    other = {"ppo": "sac", "sac": "ppo"}.get(algorithm or "")
+    for key, text in changes.items():
+        if other is not None and key.startswith(f"{other}."):
+            raise UserError(
+                f"{text} has no effect with algorithm={algorithm}: leave it out, or set "
+                f"algorithm={other}."
+            )
 
 
 def groups(recipe: Recipe) -> dict[str, tuple[list[str], str]]:

@@ -311,6 +311,10 @@ class BCConfig:
                 f"steps={run.steps}: cloning takes no environment steps; leave steps=0, "
                 f"{prefix}steps is the number of gradient steps."
             )
+        if run.algorithm != "ppo":
+            raise UserError(
+                f"algorithm={run.algorithm}: cloning is no reinforcement learning; leave it out."
+            )
         if self.stop == "held_out" and run.demo.subsample == 1:
             raise UserError(
                 f"{prefix}stop=held_out needs transitions to hold out and demo.subsample=1 leaves "
@@ -433,9 +437,9 @@ def needs_actions(name: str, reward: object) -> str | None:
     return f"{name}.use_actions=true reads: set {name}.use_actions=false" if uses else None
 
 
-def _replay_needs_actions(run: object) -> str | None:
-    chosen = getattr(getattr(run, "sac", None), "demonstration", "none")
-    if getattr(run, "algorithm", None) != "sac" or chosen == "none":
+def _replay_needs_actions(run: RunConfig) -> str | None:
+    chosen = run.sac.demonstration
+    if run.algorithm != "sac" or chosen == "none":
         return None
     return f"sac.demonstration={chosen} puts into the replay: set sac.demonstration=none"
 

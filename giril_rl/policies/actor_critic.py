@@ -72,6 +72,23 @@ class PPOAgent(Agent):
         """What computes the values for the advantages; None if :meth:`prepare` writes them."""
         return None
 
+    def imitation_loss(self, observation: Tensor, action: Tensor) -> Tensor:
+        """What behaviour cloning minimises, of each demonstrated pair, ``(*batch,)``.
+
+        Cross-entropy, or the squared error of the mean action in units in which the bounds are -1
+        and 1, averaged over its dimensions.
+
+        Args:
+            observation: raw observations ``(*batch, ...)``.
+            action: as the environment has them.
+        """
+        out = self.actor(self.normaliser(observation))
+        if not self.discrete:
+            target = action if self.bounds is None else self.bounds.inverse(action)
+            return (out - target).square().mean(-1)
+        index = action.long().argmax(-1) if self.one_hot else action.long()
+        return -out.log_softmax(-1).gather(-1, index.unsqueeze(-1)).squeeze(-1)
+
     def actor_for_loss(self) -> LossActor:
         """The module that gives :class:`torchrl.objectives.ClipPPOLoss` its distribution."""
         return LossActor(self)

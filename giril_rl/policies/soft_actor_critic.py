@@ -137,6 +137,21 @@ class SACAgent(Agent):
             return distribution.logits.gather(-1, index.unsqueeze(-1)).squeeze(-1)
         return distribution.log_prob(self.drawn(action))
 
+    def imitation_loss(self, observation: Tensor, action: Tensor) -> Tensor:
+        """What behaviour cloning minimises, of each demonstrated pair, ``(*batch,)``.
+
+        Cross-entropy, or the squared error of the squashed mean action in units in which the bounds
+        are -1 and 1, averaged over its dimensions.
+
+        Args:
+            observation: raw observations ``(*batch, observation_size)``.
+            action: as the environment has them.
+        """
+        if self.discrete:
+            return -self.log_prob(observation, action)
+        location, _ = self.actor(self.normalised(observation))
+        return (location.tanh() - self.drawn(action)).square().mean(-1)
+
     def update_normaliser(self, observation: Tensor) -> None:
         """Merges raw observations into the running statistics, if there are any."""
         if isinstance(self.normaliser, RunningNormaliser):

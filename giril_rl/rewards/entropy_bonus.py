@@ -21,6 +21,7 @@ from giril_rl.config.schema import knob
 from giril_rl.errors import UserError
 from giril_rl.networks.pixels import PixelFeatures
 from giril_rl.rewards.method import GREY, Method, register
+from giril_rl.rewards.points import DISTANCES_AT_ONCE, EXACT
 from giril_rl.rewards.scaler import ObservationScaler, PixelScaler, ScalingRule
 from giril_rl.rewards.transitions import (
     PIXELS_AT_ONCE,
@@ -32,8 +33,6 @@ from giril_rl.runs.pretrained import Pretrained, remembered
 from giril_rl.runs.randomness import seeded
 
 NEXT_STATE_KEYS: tuple[NestedKey, ...] = (("next", "observation"),)
-DISTANCES_AT_ONCE = 4_000_000
-"""Distances held in memory at a time, 16 MB of them."""
 
 
 @dataclass
@@ -41,6 +40,9 @@ class EntropyBonusConfig:
     """The state-entropy bonus."""
 
     k: int = knob(12, "nearest states of the batch whose distances are averaged (ILDE: 12)", low=1)
+    among: int = knob(
+        256, "most states that are compared with each other; a larger batch is split", low=2
+    )
     normalise: str = knob(
         "standardise",
         "observation rule of the distances",
@@ -84,9 +86,8 @@ def knn_bonus(states: Tensor, k: int) -> Tensor:
     bonuses = []
     for rows in torch.arange(n, device=states.device).split(max(1, DISTANCES_AT_ONCE // n)):
         # The exact mode: the one by matrix products gives neighbours a distance that is noise.
-        distance = torch.cdist(
-            states[rows], states, compute_mode="donot_use_mm_for_euclid_dist"
-        ).scatter(1, rows.unsqueeze(1), float("inf"))
+        distance = torch.cdist(states[rows], states, compute_mode=EXACT)
+        distance = distance.scatter(1, rows.unsqueeze(1), float("inf"))
         bonuses.append(distance.topk(k, largest=False, sorted=False).values.mean(1).log1p())
     return torch.cat(bonuses)
 
@@ -96,7 +97,9 @@ class EntropyBonus(Pretrained, TransitionReward):
 
     All transitions of one call are one batch, whatever its leading shape. The number depends on the
     batch: compute it for the batch that the policy is updated with. A single transition gets 0, so
-    that it does not work step by step in an environment.
+    that it does not work step by step in an environment. A batch of more than ``among`` transitions
+    is split into parts of equal size, of which each takes every so many-th transition, so that the
+    number does not depend on how many minibatches are drawn at once.
 
     Only the scaler has to be fitted. Frames are compared by random features, which stay as they
     are: ICM's convolutions, untrained (as in RE3, Seo et al. 2021).
@@ -105,6 +108,7 @@ class EntropyBonus(Pretrained, TransitionReward):
         scaler: applied to observations.
         features: maps scaled observations ``(n, ...)`` to ``(n, d)``; None compares observations.
         k: number of neighbours.
+        among: most states that are compared with each other.
         in_keys: key of the next observation, one.
         out_keys: where the reward is written, one key.
 
@@ -125,13 +129,14 @@ class EntropyBonus(Pretrained, TransitionReward):
         features: nn.Module | None = None,
         *,
         k: int = 12,
+        among: int = 256,
         in_keys: Sequence[NestedKey] = NEXT_STATE_KEYS,
         out_keys: Sequence[NestedKey] = REWARD_KEYS,
     ) -> None:
         super().__init__("a state-entropy bonus", ("next observation",), in_keys, out_keys)
         self.scaler = scaler
         self.features = None if features is None else features.requires_grad_(False).eval()
-        self.k = k
+        self.k, self.among = k, among
 
     @classmethod
     @remembered
@@ -141,6 +146,7 @@ class EntropyBonus(Pretrained, TransitionReward):
         action_spec: TensorSpec | None = None,
         *,
         k: int = 12,
+        among: int = 256,
         normalise: ScalingRule = "standardise",
         seed: int = 0,
         in_keys: Sequence[NestedKey] = NEXT_STATE_KEYS,
@@ -152,6 +158,7 @@ class EntropyBonus(Pretrained, TransitionReward):
             observation_dim: size of the observation.
             action_spec: has no effect, for actions play no role.
             k: number of neighbours.
+            among: see the class.
             normalise: the scaler's rule.
             seed: has no effect, for nothing is random.
             in_keys: see the class.
@@ -161,7 +168,7 @@ class EntropyBonus(Pretrained, TransitionReward):
             UserError: for an unknown rule.
         """
         scaler = ObservationScaler(observation_dim, rule=normalise, clamp=False)
-        return cls(scaler, k=k, in_keys=in_keys, out_keys=out_keys)
+        return cls(scaler, k=k, among=among, in_keys=in_keys, out_keys=out_keys)
 
     @classmethod
     @remembered
@@ -171,6 +178,7 @@ class EntropyBonus(Pretrained, TransitionReward):
         *,
         channels: int = 4,
         k: int = 12,
+        among: int = 256,
         seed: int = 0,
         in_keys: Sequence[NestedKey] = NEXT_STATE_KEYS,
         out_keys: Sequence[NestedKey] = REWARD_KEYS,
@@ -178,7 +186,7 @@ class EntropyBonus(Pretrained, TransitionReward):
         """The bonus of random features of ``channels`` frames, drawn from ``seed``."""
         with seeded(seed):
             features = PixelFeatures(channels)
-        return cls(PixelScaler(), features, k=k, in_keys=in_keys, out_keys=out_keys)
+        return cls(PixelScaler(), features, k=k, among=among, in_keys=in_keys, out_keys=out_keys)
 
     def train(self, mode: bool = True) -> EntropyBonus:
         """Sets the mode of all but the features, whose batch normalisation must not learn."""
@@ -197,7 +205,12 @@ class EntropyBonus(Pretrained, TransitionReward):
         events = self.scaler.event_dims
         batch = observation.shape[: observation.ndim - events]
         flat = observation.reshape(-1, *observation.shape[observation.ndim - events :])
-        return knn_bonus(self.points(flat), self.k).reshape(batch)
+        points = self.points(flat)
+        parts = max(1, -(-len(points) // self.among))
+        bonus = points.new_empty(len(points))
+        for i in range(parts):
+            bonus[i::parts] = knn_bonus(points[i::parts], self.k)
+        return bonus.reshape(batch)
 
     def points(self, observation: Tensor) -> Tensor:
         """What distances are computed between, ``(n, d)``, for observations ``(n, ...)``."""
@@ -225,7 +238,9 @@ def entropy_bonus(
         >>> entropy_bonus(EntropyBonusConfig(), GymEnv("CartPole-v1"), pairs).scaler
         ObservationScaler(4, rule='standardise', clamp=False)
     """
-    reward = reward_for(env, EntropyBonus, settings, seed=seed, of_all="k", of_vectors="normalise")
+    reward = reward_for(
+        env, EntropyBonus, settings, seed=seed, of_all="k among", of_vectors="normalise"
+    )
     reward.scaler.fit(pairs.get("observation"))
     return reward
 

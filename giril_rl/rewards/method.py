@@ -47,7 +47,6 @@ class Method:
         scope: what the reward of a transition depends on besides the reward's own state: the
             "transition" alone, the whole "batch" that it is computed with, or the "trajectory" so
             far.
-        along_time: whether its reward depends on an episode's earlier steps.
         rank: its place in tables; those of equal rank are sorted by name.
     """
 
@@ -62,7 +61,6 @@ class Method:
     build: Callable[..., TensorDictModuleBase] | None = None
     loss: Callable[[Any, Any], LossModule] | None = None
     derive: Callable[[TensorDictModuleBase, Moments, int], TensorDictModuleBase] | None = None
-    along_time: bool = False
     rank: int = 100
 
 

@@ -18,7 +18,7 @@ from torch import Tensor
 from torchrl.data import TensorSpec
 from torchrl.envs import EnvBase
 
-from giril_rl.config.schema import knob
+from giril_rl.config.schema import USE_ACTIONS, knob
 from giril_rl.errors import UserError
 from giril_rl.rewards.atoms import Atoms, check_vectors, spaces_of
 from giril_rl.rewards.method import SKY, Method, register
@@ -39,7 +39,7 @@ class PWILConfig:
     horizon: int | None = knob(
         None, "steps of an episode that are paid for, T; null takes the task's time limit", low=1
     )
-    use_actions: bool = knob(True, "compare states and actions rather than states alone")
+    use_actions: bool = knob(True, USE_ACTIONS)
 
     def check(self, prefix: str, run: Any) -> None:
         """Refuses frames, before anything is trained."""
@@ -95,27 +95,35 @@ def greedy_coupling(
     """
     left, atoms = left.clone(), left.shape[1]
     least = -(-int(demand.max()) // full)  # Atoms that a step needs at least.
+    whole = full == 1  # Every move takes a whole atom, which needs less bookkeeping.
     nothing, never = distance.new_zeros(()), distance.new_tensor(torch.inf)
     used = torch.where(left == 0, never, nothing)
+    asked = demand.unsqueeze(-1)
+    emptied, one = torch.where(asked > 0, never, nothing), (asked > 0).long()
     steps: list[int] = []
     moves: list[Tensor] = []
     for t, restart in enumerate(ends.any(1).tolist()):
-        near, missing = distance[t] + used, demand[t].unsqueeze(-1)
+        near, missing = distance[t] + used, asked[t]
         for count in range(1, atoms + 1):
             nearest = near.min(1, keepdim=True).indices
-            there = left.gather(1, nearest)
-            taken = torch.minimum(there, missing)
-            left.scatter_add_(1, nearest, -taken)
-            used.scatter_(1, nearest, torch.where(taken == there, never, nothing))
-            missing = missing - taken
+            if whole:
+                taken = one[t]
+                used.scatter_add_(1, nearest, emptied[t])
+            else:
+                there = left.gather(1, nearest)
+                taken = torch.minimum(there, missing)
+                left.scatter_add_(1, nearest, -taken)
+                used.scatter_(1, nearest, torch.where(taken == there, never, nothing))
+                missing = missing - taken
             steps.append(t)
             moves += nearest, taken
-            if count >= least and not missing.any():
+            if count >= least and (whole or not missing.any()):
                 break
             near.scatter_(1, nearest, torch.inf)
         if restart:
             left[ends[t]], used[ends[t]] = full, 0.0
     done = torch.cat(moves, 1).T
+    left = (used == 0).long() if whole else left
     return torch.tensor(steps, device=left.device), done[::2], done[1::2], left
 
 
@@ -286,6 +294,6 @@ register(
         trained="never",
         settings=PWILConfig,
         build=pwil_reward,
-        along_time=True,
+        scope="trajectory",
     )
 )

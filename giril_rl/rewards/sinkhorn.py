@@ -19,7 +19,7 @@ from torch import Tensor
 from torchrl.data import TensorSpec
 from torchrl.envs import EnvBase
 
-from giril_rl.config.schema import knob
+from giril_rl.config.schema import USE_ACTIONS, knob
 from giril_rl.errors import UserError
 from giril_rl.rewards.atoms import Atoms, check_vectors, spaces_of
 from giril_rl.rewards.method import GREY, Method, register
@@ -49,7 +49,7 @@ class SinkhornConfig:
     first_return: float = knob(
         10.0, "what the first episode is made to lose in all", low=0, low_open=True
     )
-    use_actions: bool = knob(False, "compare states and actions rather than states alone")
+    use_actions: bool = knob(False, USE_ACTIONS)
 
     def check(self, prefix: str, run: Any) -> None:
         """Refuses frames, before anything is trained."""
@@ -308,6 +308,6 @@ register(
         trained="never",
         settings=SinkhornConfig,
         build=sinkhorn_reward,
-        along_time=True,
+        scope="trajectory",
     )
 )

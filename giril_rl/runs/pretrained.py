@@ -47,8 +47,12 @@ def remembered(constructor: Constructor) -> Constructor:
         made = constructor(owner, *args, **kwargs)
         bound = signature.bind(owner, *args, **kwargs)
         bound.apply_defaults()
-        _, *given = bound.arguments.items()
-        (owner if made is None else made)._made_by = constructor.__name__, dict(given)
+        _, *others = bound.arguments.items()
+        given = dict(others)
+        for name, parameter in signature.parameters.items():
+            if parameter.kind is parameter.VAR_KEYWORD:
+                given |= given.pop(name)
+        (owner if made is None else made)._made_by = constructor.__name__, given
         return made
 
     return construct

@@ -11,10 +11,12 @@ from giril_rl.training.baselines import (
     held_action_scores,
 )
 from giril_rl.training.cloning import clone_behaviour
+from giril_rl.training.cloning_beside import CloningTrainer
 from giril_rl.training.demonstrations import check_inputs, obtain_demonstration, open_run
 from giril_rl.training.experts import check_task, train_expert
 from giril_rl.training.fitting import fit_reward
 from giril_rl.training.loop import Trained, train_policy
+from giril_rl.training.own_visits import VisitTrainer
 from giril_rl.training.ppo import PPO, return_scaling
 from giril_rl.training.result import finish_run
 from giril_rl.training.reward_trainers import (
@@ -31,12 +33,14 @@ __all__ = [
     "SAC",
     "AdversarialTrainer",
     "Algorithm",
+    "CloningTrainer",
     "HeldAction",
     "RandomPolicy",
     "RewardTrainer",
     "Run",
     "Scores",
     "Trained",
+    "VisitTrainer",
     "absorbing_value",
     "check_discrete",
     "check_inputs",

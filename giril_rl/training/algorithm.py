@@ -7,11 +7,12 @@ from typing import Any, Protocol, cast
 
 import torch
 from tensordict import TensorDictBase
-from torch import Tensor, nn
+from torch import nn
 
 from giril_rl.config.schema import DemoRunConfig, RunConfig, ScalingConfig
 from giril_rl.demos import Demonstration, subsample
 from giril_rl.envs import BatchedEnv
+from giril_rl.errors import UserError
 from giril_rl.policies.agent import Agent
 from giril_rl.policies.making import make_agent, make_sac_agent
 from giril_rl.rewards.trajectory import fresh_episodes, trajectory_rewards
@@ -85,7 +86,6 @@ def make_algorithm(
     transform: nn.Module | None = None,
     moving: bool = False,
     demonstration_reward: float | None = None,
-    absorbing: Callable[[], Tensor] | None = None,
     use: Use = "training",
 ) -> PPO | SAC:
     """The algorithm that ``cfg.algorithm`` names, with an untrained agent for ``env``.
@@ -100,11 +100,11 @@ def make_algorithm(
             anew for each minibatch.
         demonstration_reward: the reward of each demonstrated transition in SAC's replay buffer;
             None lets ``transform`` compute it.
-        absorbing: see :class:`~giril_rl.training.sac.SAC`.
         use: what the random numbers are for.
 
     Raises:
-        UserError: if the algorithm has no form for the environment's spaces.
+        UserError: if the algorithm has no form for the environment's spaces, or the replay buffer
+            cannot hold the demonstration.
     """
     termination = getattr(cfg, "termination", "ends")
     if cfg.algorithm == "ppo":
@@ -125,8 +125,29 @@ def make_algorithm(
         relabel_episodes=_of_whole_episodes(transform),
         scaling=_scaling(scaling, cfg.sac.gamma) if isinstance(scaling, ScalingConfig) else None,
         termination=termination,
-        absorbing=absorbing,
     )
+
+
+def check_replay(cfg: RunConfig, demo: Demonstration) -> None:
+    """Refuses a demonstration that cannot be put into SAC's replay buffer, where it is to be.
+
+    Raises:
+        UserError: if it has no actions, or more transitions than ``sac.buffer_size``, once 1 in
+            ``demo.subsample`` was kept.
+    """
+    if cfg.algorithm != "sac" or cfg.sac.demonstration == "none":
+        return
+    if not demo.has_actions:
+        raise UserError(
+            f"the demonstration has no actions, which sac.demonstration={cfg.sac.demonstration} "
+            "puts into the replay: set sac.demonstration=none."
+        )
+    pairs = -(-len(demo) // _every(cfg))
+    if pairs > cfg.sac.buffer_size:
+        raise UserError(
+            f"sac.buffer_size={cfg.sac.buffer_size} is less than the demonstration's {pairs:,} "
+            "transitions: give the buffer more room, or set sac.demonstration=none."
+        )
 
 
 def _scaling(cfg: ScalingConfig, gamma: float) -> ReturnScaling | None:
@@ -159,11 +180,16 @@ def _demonstrated(
 
     The reward is that of the whole episodes, of which transitions are left out afterwards.
     """
+    check_replay(cfg, demo)
     known = demo.transitions.clone(False)
     if reward is not None:
         known.set(("next", "reward"), torch.full((len(demo), 1), reward))
     elif transform is not None and not moving:
         with fresh_episodes(transform):
             known = transform(known.unsqueeze(0).to(cfg.device)).squeeze(0)
-    every = cfg.demo.subsample if isinstance(cfg, DemoRunConfig) else 1
-    return subsample(Demonstration(known.cpu()), every)
+    return subsample(Demonstration(known.cpu()), _every(cfg))
+
+
+def _every(cfg: RunConfig) -> int:
+    """1 in how many demonstrated transitions is kept."""
+    return cfg.demo.subsample if isinstance(cfg, DemoRunConfig) else 1

@@ -32,6 +32,7 @@ from giril_rl.policies.making import load_agent
 from giril_rl.runs.finished import read_config, read_part, read_result
 from giril_rl.runs.identity import NO_EFFECT, config_hash, out_folder, safe, without_added
 from giril_rl.runs.run import Run
+from giril_rl.training.algorithm import check_replay
 from giril_rl.training.experts import check_task, expert_settings, made_once, obtain_expert
 from giril_rl.training.outlook import announce
 
@@ -87,33 +88,10 @@ def _given_demonstration(cfg: DemoRunConfig, chosen: DemoConfig) -> Demonstratio
     return _used_part(demo, cfg, chosen)
 
 
-def _used_part(demo: Demonstration, cfg: DemoRunConfig, chosen: DemoConfig) -> Demonstration:
+def _used_part(demo: Demonstration, cfg: RunConfig, chosen: DemoConfig) -> Demonstration:
     used = shortened(demo, episodes=chosen.episodes, first=chosen.first)
-    check_replay(cfg, len(used))
+    check_replay(cfg, used)
     return used
-
-
-def check_replay(cfg: RunConfig, transitions: int) -> None:
-    """Refuses a replay buffer that cannot hold the demonstration that is put into it.
-
-    Args:
-        cfg: the run's settings.
-        transitions: of the demonstration, before 1 in ``demo.subsample`` is kept.
-
-    Raises:
-        UserError: with ``algorithm=sac``, if ``sac.buffer_size`` is too small.
-    """
-    sac = getattr(cfg, "sac", None)
-    if getattr(cfg, "algorithm", None) != "sac" or getattr(sac, "demonstration", "none") == "none":
-        return
-    demo = getattr(cfg, "demo", None)
-    pairs = -(-transitions // (demo.subsample if isinstance(demo, DemoConfig) else 1))
-    size = getattr(sac, "buffer_size", None)
-    if size is not None and size < pairs:
-        raise UserError(
-            f"sac.buffer_size={size} is smaller than the demonstration, of which {pairs:,} "
-            "transitions are kept in the replay: give a larger one, or set sac.demonstration=none."
-        )
 
 
 def obtain_demonstration(

@@ -11,6 +11,8 @@ STEPS_PER_SECOND = {
     "image": {"player": 500, "reward model": 12, "policy": 500},
 }
 """Rough rates of one core of a server of 2023, by kind of observation."""
+SAC_UPDATES_PER_SECOND = 300
+"""The same for gradient steps of SAC, two hidden layers of 128 units and minibatches of 128."""
 
 
 def outlook(
@@ -39,7 +41,10 @@ def outlook(
     if isinstance(fit, FitConfig) and fit.steps:
         parts[f"reward model: {fit.steps:,} steps"] = fit.steps / rates["reward model"]
     if cfg.steps:
-        parts[f"policy: {cfg.steps:,} steps"] = cfg.steps / rates["policy"]
+        rate = (
+            SAC_UPDATES_PER_SECOND / cfg.sac.updates if cfg.algorithm == "sac" else rates["policy"]
+        )
+        parts[f"policy: {cfg.steps:,} steps"] = cfg.steps / rate
     return parts
 
 

@@ -53,8 +53,6 @@ class SAC:
         scaling: divides rewards by its running standard deviation as they are drawn; it learns from
             each batch. None does not scale.
         termination: "ends" or "bootstrap", see :class:`~giril_rl.training.ppo.PPO`.
-        absorbing: gives the reward of each step in the absorbing state after a failure; a failure
-            is then worth ``gamma / (1 - gamma)`` of it (Kostrikov et al., 2019). None for none.
 
     Raises:
         UserError: for another ``termination``, or a demonstration that the buffer cannot hold.
@@ -96,7 +94,6 @@ class SAC:
         relabel_episodes: Callable[[TensorDictBase], TensorDictBase] | None = None,
         scaling: ReturnScaling | None = None,
         termination: str = "ends",
-        absorbing: Callable[[], Tensor] | None = None,
     ) -> None:
         if termination not in ("ends", "bootstrap"):
             raise UserError(f"termination={termination}: choose one of ends, bootstrap.")
@@ -109,7 +106,7 @@ class SAC:
         self.checkpoint_every = min(cfg.checkpoint_every, self._slack - self.frames_per_batch)
         self.steps = cfg.whole_batches(steps)
         self.bootstraps_failure = termination == "bootstrap"
-        self.relabel, self.scaling, self.absorbing = relabel, scaling, absorbing
+        self.relabel, self.scaling = relabel, scaling
         self.relabel_episodes = relabel_episodes
         self.held = HeldEpisodes()
         self._taken = self._updates = 0
@@ -194,9 +191,6 @@ class SAC:
         reward, terminated = drawn.get(REWARD), drawn.get(TERMINATED)
         if self.bootstraps_failure:
             terminated = torch.zeros_like(terminated)
-        elif self.absorbing is not None:
-            worth = self.absorbing() * (cfg.gamma / (1 - cfg.gamma))
-            reward = reward + terminated * worth
         onward = drawn.get(ONWARD, None)
         columns = (
             agent.normalised(drawn.get(OBSERVATION)),

@@ -223,7 +223,7 @@ def test_a_run_that_died_ends_as_an_undisturbed_one(words, root, tmp_path, monke
         (
             ["control", "reward=bogus"],
             "reward=bogus must be 'constant', 'untrained_giril', 'untrained_icm', 'copy', 'noise', "
-            "'negated_giril', 'centred_giril', 'random' or 'held_action'.",
+            "'negated_giril', 'centred_giril', 'entropy_bonus', 'random' or 'held_action'.",
         ),
         (["control", "giril.beta=0"], "giril.beta=0.0 must be greater than 0."),
         (

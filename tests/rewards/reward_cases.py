@@ -15,7 +15,9 @@ from torchrl.data import Bounded, Categorical, TensorSpec, Unbounded
 from giril_rl.methods import methods
 from giril_rl.networks.normalise import RunningNormaliser
 from giril_rl.rewards import NoiseReward, ObservationScaler
+from giril_rl.rewards.dril import DisagreementConfig
 from giril_rl.rewards.method import Method, Scope
+from giril_rl.runs.randomness import seeded
 
 DIM = 3
 FRAMES = (4, 84, 84)
@@ -118,7 +120,7 @@ def registered_cases() -> list[Case]:
     """
     found = []
     for name, method in methods().items():
-        if method.build is None or method.along_time:  # Those have checks of their own.
+        if method.build is None or method.scope == "trajectory":  # Those have checks of their own.
             continue
         kinds = ("box", "discrete", "pixels") if method.kind == "method" else ("box",)
         for kind in kinds:
@@ -135,6 +137,8 @@ def settings_of(method: Method, kind: str) -> Any:
         return None
     settings = method.settings()
     changes: dict[str, Any] = {"normalise": "pixels"} if kind == "pixels" else {"hidden": [16, 16]}
+    if isinstance(settings, DisagreementConfig):
+        changes["form"] = "variance"  # A sign hides what it depends on.
     return replace(settings, **{k: v for k, v in changes.items() if hasattr(settings, k)})
 
 
@@ -148,12 +152,23 @@ def of_method(method: Method, kind: str, setting: Setting) -> TensorDictModuleBa
             else Unbounded((DIM,))
         },
     )
-    seen = torch.zeros(2, *FRAMES, dtype=torch.uint8) if kind == "pixels" else demonstration(0)
-    pairs = TensorDict({"observation": seen}, [len(seen)])
+    pairs = demonstrated(kind, setting)
     reward = method.build(settings_of(method, kind), env, pairs, seed=setting.seed)
     if method.derive is not None:
         reward = method.derive(reward, lambda: (2.0, 0.5), setting.seed)
     return reward
+
+
+def demonstrated(kind: str, setting: Setting) -> TensorDict:
+    """Transitions of a demonstration; observations are those of :func:`demonstration`, seed 0."""
+    seen = torch.zeros(2, *FRAMES, dtype=torch.uint8) if kind == "pixels" else demonstration(0)
+    with seeded(setting.seed):
+        action = setting.spec.rand((len(seen),))
+    values = {"observation": seen, "action": action, "next_observation": seen.flip(0)}
+    out = TensorDict(batch_size=[len(seen)])
+    for name, value in values.items():
+        out.set(setting.keys[name], value)
+    return out
 
 
 def build(case: Case, *, seed: int = 0, keys: dict = PLAIN, fit: bool = True):

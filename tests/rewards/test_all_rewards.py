@@ -9,7 +9,15 @@ from dataclasses import replace
 import pytest
 import reward_checks as checks
 import torch
-from reward_cases import Case, build, of_method, registered_cases, settings_of, transitions
+from reward_cases import (
+    Case,
+    build,
+    demonstrated,
+    of_method,
+    registered_cases,
+    settings_of,
+    transitions,
+)
 from reward_data import total
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
@@ -29,7 +37,10 @@ from giril_rl.rewards import (
     PixelScaler,
 )
 from giril_rl.rewards.airl import AIRLReward
+from giril_rl.rewards.dril import DisagreementReward
 from giril_rl.rewards.method import GREY, Method, register, unregister
+from giril_rl.rewards.mmd import MMDReward
+from giril_rl.rewards.nearest import NearestReward
 from giril_rl.rewards.red import DistillationReward
 
 PAIR, STATES = ("observation", "action"), ("observation", "next_observation")
@@ -59,9 +70,25 @@ def centred(c):
     return AffineReward(of_vectors(GenerativeReward, hidden=[16], beta=0.9)(c), shift=-0.3)
 
 
+def of_points(cls, kind="box", **kwargs):
+    def build(c):
+        pairs = demonstrated(kind, c)
+        common = {"atoms": len(pairs), "seed": c.seed, **kwargs, **c.reads()}
+        make = cls.for_pixels if kind == "pixels" else functools.partial(cls.for_vectors, c.dim)
+        reward = make(c.spec, **common)
+        reward.remember(pairs)
+        if cls is MMDReward:
+            visits = transitions(Case("visits", build, kind), 9, keys=c.keys, seed=5)
+            reward.observe(visits)
+        return reward
+
+    return build
+
+
 GIRIL = functools.partial(of_vectors, GenerativeReward, hidden=[16, 16])
 GAIL = functools.partial(of_vectors, DiscriminatorReward, *PAIR, hidden=[16, 16])
 VAIL = functools.partial(of_vectors, BottleneckReward, *PAIR, hidden=[16, 16], latent=4)
+DRIL = {"hidden": [16], "variance": "state", "form": "variance"}
 # Clamped raw observations would stop at 1, in the middle of the checks' data.
 RAW = {"normalise": "raw", "clamp": False}
 VARIANTS = [
@@ -82,6 +109,13 @@ VARIANTS = [
     Case("gail-states", GAIL(use_actions=False)),
     Case("vail-states", VAIL(use_actions=False), "discrete"),
     Case("red-states", of_vectors(DistillationReward, *PAIR, use_actions=False), "discrete"),
+    Case("nearest-gaussian", of_points(NearestReward, kernel="gaussian")),
+    Case("nearest-raw-next", of_points(NearestReward, normalise="raw", use_next=True)),
+    Case("nearest-states", of_points(NearestReward, use_actions=False, clamp=None)),
+    Case("mmd-next", of_points(MMDReward, use_next=True, every=1)),
+    Case("mmd-states", of_points(MMDReward, use_actions=False, use_next=True), "box", STATES),
+    Case("mmd-pixels-states", of_points(MMDReward, "pixels", use_actions=False), "pixels"),
+    Case("dril-state", of_vectors(DisagreementReward, *PAIR, **DRIL), "box", ("observation",)),
     Case("copy", copied),
     Case("constant", lambda c: ConstantReward(2.0, out_keys=c.out_keys)),
     Case(

@@ -71,6 +71,16 @@ def test_all_transitions_of_a_call_are_one_batch():
     torch.testing.assert_close(bonus(reward, states[order]), whole[order])
 
 
+def test_a_large_batch_is_compared_in_parts():
+    reward = EntropyBonus.for_vectors(2, k=3, among=10, normalise="raw")
+    states = torch.randn(25, 2)
+    paid = bonus(reward, states).squeeze(-1)
+    for i in range(3):
+        torch.testing.assert_close(paid[i::3], knn_bonus(states[i::3], 3))
+    # Of as many as `among`, it is the whole batch's.
+    torch.testing.assert_close(bonus(reward, states[:10]).squeeze(-1), knn_bonus(states[:10], 3))
+
+
 def test_it_grows_with_the_spread():
     states = torch.randn(60, 3)
     assert (knn_bonus(3 * states, 5) > knn_bonus(states, 5)).all()

@@ -16,7 +16,8 @@ from giril_rl.errors import UserError
 from giril_rl.rewards import AdversarialConfig
 from giril_rl.runs.identity import config_hash
 from giril_rl.training import check_inputs, obtain_demonstration
-from giril_rl.training.demonstrations import check_replay, demonstration_place, find_demonstration
+from giril_rl.training.algorithm import check_replay
+from giril_rl.training.demonstrations import demonstration_place, find_demonstration
 
 CARTPOLE = TaskConfig("cartpole", "CartPole-v1")
 TINY = ["ppo.num_envs=2", "ppo.rollout=32", "ppo.minibatch=32", "ppo.epochs=1", "ppo.hidden=[8]"]
@@ -95,25 +96,17 @@ def test_the_copy_needs_no_actions(given, tmp_path):
     assert main(words("control", given, "states", tmp_path / "run", "reward=copy")) == 0
 
 
-def test_states_are_not_put_into_a_replay(given):
-    @dataclass
-    class SAC:
-        demonstration: str = "seed"
-        buffer_size: int = 1_000_000
-
-    @dataclass
-    class OffPolicy(Config):
-        algorithm: str = "sac"
-        sac: SAC = field(default_factory=SAC)
-
-    states = config(given, "states")
-    reward = AdversarialConfig(use_actions=False)
-    cfg = OffPolicy(task=CARTPOLE, steps=64, demo=states.demo, reward=reward)
-    for chosen in ("seed", "half"):
-        cfg.sac.demonstration = chosen
-        with pytest.raises(UserError, match=f"sac.demonstration={chosen} puts .* set sac.demonst"):
-            check_inputs(cfg)
-    check_inputs(replace(cfg, algorithm="ppo"))
+@pytest.mark.parametrize("chosen", ["seed", "half"])
+def test_states_are_not_put_into_a_replay(chosen, given):
+    cfg = config(given, "states")
+    cfg.reward.use_actions = False
+    check_inputs(cfg)
+    cfg.algorithm, cfg.sac.demonstration = "sac", chosen
+    told = f"has no actions, which sac.demonstration={chosen} puts into the replay: set sac.demo"
+    with pytest.raises(UserError, match=told):
+        check_inputs(cfg)
+    with pytest.raises(UserError, match=told):
+        check_replay(cfg, Demonstration.load(given / "states"))
     cfg.sac.demonstration = "none"
     check_inputs(cfg)
 
@@ -174,29 +167,29 @@ def test_a_shipped_demonstration_stays_the_tasks_own():
     assert len(demo) == 62 and demo.mean_return() == 1000.0
 
 
-@pytest.mark.parametrize(
-    ("size", "subsample", "fits"), [(1000, 1, True), (999, 1, False), (50, 20, True)]
-)
-def test_a_replay_buffer_holds_the_demonstration(size, subsample, fits):
-    @dataclass
-    class SAC:
-        demonstration: str = "seed"
-        buffer_size: int = size
+def test_a_replay_buffer_holds_the_demonstration_before_anything_is_trained(given):
+    whole = Demonstration.load(given / "whole")
+    cfg = config(given)
+    cfg.algorithm, cfg.sac.buffer_size = "sac", len(whole)
+    check_inputs(cfg)
+    cfg.sac.buffer_size -= 1
+    with pytest.raises(UserError, match=rf"^sac\.buffer_size=\d+ is less .* {len(whole)} tr"):
+        check_inputs(cfg)
+    cfg.demo.first = len(whole) - 1  # What is not used needs no room.
+    check_inputs(cfg)
+    cfg.demo.first, cfg.demo.subsample = None, 2
+    check_inputs(cfg)
+    cfg.demo.subsample = 1
+    cfg.demo.first, cfg.sac.demonstration = None, "none"
+    check_inputs(cfg)
 
-    @dataclass
-    class OffPolicy(Config):
-        algorithm: str = "sac"
-        sac: SAC = field(default_factory=SAC)
 
-    cfg = OffPolicy(task=CARTPOLE, steps=64, demo=DemoConfig(subsample=subsample))
-    if fits:
-        check_replay(cfg, 1000)
-    else:
-        with pytest.raises(UserError, match=r"^sac\.buffer_size=999 is smaller .* of which 1,000"):
-            check_replay(cfg, 1000)
-        check_replay(replace(cfg, algorithm="ppo"), 1000)
-        cfg.sac.demonstration = "none"
-        check_replay(cfg, 1000)
+def test_off_policy_a_reward_of_states_is_learned_from_states(given, tmp_path):
+    off = ["algorithm=sac", "sac.demonstration=none", "sac.random_steps=16", "sac.hidden=[8]"]
+    off += ["reward.use_actions=false", "demo.subsample=1"]
+    kept = [w for w in words("red", given, "states", tmp_path / "run", *off) if "ppo." not in w]
+    assert main(kept) == 0
+    assert json.loads((tmp_path / "run/result.json").read_text())["env_steps"] == 64
 
 
 # Of another task

@@ -1,0 +1,77 @@
+"""DRIL: a reward for acting where cloned policies agree, and a policy cloned beside.
+
+Demonstration -> ensemble of cloned policies -> +1 where they agree, -1 elsewhere -> SAC or PPO with
+behaviour cloning -> true score.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import torch
+from torchrl.envs import Compose
+
+from giril_rl.config.schema import FitConfig, RewardRunConfig
+from giril_rl.demos import holdout, subsample
+from giril_rl.envs import make_env
+from giril_rl.rewards.disagreement import BOOTSTRAP, bootstrapped
+from giril_rl.rewards.dril import DisagreementConfig, DisagreementLoss, dril_reward
+from giril_rl.training import (
+    CloningTrainer,
+    finish_run,
+    fit_reward,
+    make_algorithm,
+    obtain_demonstration,
+    open_run,
+    return_scaling,
+    train_policy,
+)
+from giril_rl.transforms import IntrinsicReward
+
+
+@dataclass
+class Config(RewardRunConfig):
+    """What `giril run dril` takes."""
+
+    reward: DisagreementConfig = field(default_factory=DisagreementConfig)
+    fit: FitConfig = field(default_factory=FitConfig)
+
+
+def main(cfg: Config, out: Path) -> None:
+    """Train the whole chain and leave its run folder in ``out``."""
+    with open_run(cfg, out, recipe=Path(__file__).stem) as run:
+        if run.finished:
+            return
+        demo, expert = obtain_demonstration(cfg)
+        pairs, validation = subsample(demo, cfg.demo.subsample), holdout(demo, cfg.demo.subsample)
+        env = run.closing(make_env(cfg.task, cfg.learner.num_envs, cfg.seed))
+
+        seed, settings = cfg.reward_seed, cfg.reward
+        reward = dril_reward(settings, env, pairs, seed=seed).to(cfg.device)
+        samples = bootstrapped(pairs, settings.members, seed=seed)
+        # Every member is held to all of what no member has seen.
+        validation[BOOTSTRAP] = torch.ones(len(validation), settings.members)
+        loss = DisagreementLoss(reward, bootstrap=True)
+        fit_reward(loss, samples, cfg.fit, seed=seed, run=run, validation=validation)
+        reward.calibrate(pairs, settings.quantile)
+
+        transform = Compose(
+            IntrinsicReward(reward),
+            *return_scaling(cfg),
+        )
+        learner = make_algorithm(env, cfg, run=run, demo=demo, transform=transform)
+        cloning = None
+        if settings.bc_every is not None:
+            cloning = CloningTrainer(
+                learner.agent,
+                pairs,
+                every=settings.bc_every,
+                batch=settings.bc_batch,
+                lr=settings.bc_lr,
+                seed=cfg.seed,
+            )
+        trained = train_policy(
+            env, learner, transform, seed=cfg.seed, run=run, reward_trainer=cloning
+        )
+        finish_run(run, cfg, learner.agent, trained, expert=expert, demo=demo, reward=reward)

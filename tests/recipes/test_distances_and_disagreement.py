@@ -1,0 +1,82 @@
+"""The recipes nearest, mmd and dril and the bonus alone, with either learner; little is learned."""
+
+import json
+from unittest.mock import patch
+
+import pytest
+from short_runs import Killed, rows, weights
+
+from giril_rl.cli.command_line import main
+from giril_rl.runs.run import Run
+
+SHORT = [
+    *("steps=512", "eval.episodes=1", "logger=null", "expert.steps=2000", "demo.length=100"),
+    *("demo.subsample=2", "task.env_id=CartPole-v1", "ppo.num_envs=2", "ppo.rollout=64"),
+    *("ppo.minibatch=64", "ppo.epochs=1", "ppo.hidden=[16,16]", "ppo.checkpoint_every=128"),
+    *("sac.num_envs=2", "sac.rollout=8", "sac.batch=16", "sac.hidden=[16]", "sac.random_steps=64"),
+    *("sac.checkpoint_every=128", "sac.log_every=64"),
+]
+DRIL = ["fit.steps=20", "fit.log_every=10", "reward.hidden=[16]", "reward.bc_every=50"]
+RECIPES = {
+    "nearest": [],
+    "mmd": ["reward.visits=20", "reward.kept=all"],
+    "dril": DRIL,
+    "control": ["reward=entropy_bonus"],
+}
+METRICS = {"mmd": ["mmd/squared", "mmd/visits"], "dril": ["bc/loss"]}
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory):
+    """Where this file's runs share one expert and one demonstration."""
+    return tmp_path_factory.mktemp("runs")
+
+
+def words(recipe, out, root, *more):
+    by_key = {
+        word.split("=")[0]: word
+        for word in [*SHORT, *RECIPES[recipe], f"out={out}", f"root={root}", *more]
+    }
+    return ["run", recipe, *by_key.values()]
+
+
+@pytest.mark.parametrize("algorithm", ["ppo", "sac"])
+@pytest.mark.parametrize("recipe", RECIPES)
+def test_from_command_to_result_and_resumed_bit_for_bit(recipe, algorithm, root, tmp_path):
+    learner = f"algorithm={algorithm}"
+    assert main(words(recipe, tmp_path / "whole", root, learner)) == 0
+    result = json.loads((tmp_path / "whole" / "result.json").read_text())
+    assert result["env_steps"] == 512
+    found = [row for row in rows(tmp_path / "whole") if row["phase"] == algorithm]
+    for name in METRICS.get(recipe, []):
+        assert any(name in row for row in found)
+    log = Run.log
+
+    def killed(self, step, values, *, phase):
+        log(self, step, values, phase=phase)
+        if phase == algorithm and step >= 300:
+            raise Killed
+
+    with patch.object(Run, "log", killed):
+        assert main(words(recipe, tmp_path / "killed", root, learner)) == 1
+    assert main(words(recipe, tmp_path / "killed", root, learner)) == 0
+    assert weights(tmp_path / "killed") == weights(tmp_path / "whole")
+    assert rows(tmp_path / "killed") == rows(tmp_path / "whole")
+
+
+@pytest.mark.parametrize("recipe", ["nearest", "mmd"])
+def test_without_actions(recipe, root, tmp_path):
+    more = ["reward.use_actions=false", "reward.use_next=true", "steps=128"]
+    assert main(words(recipe, tmp_path / "run", root, *more)) == 0
+
+
+def test_dril_without_cloning_beside_and_all_transitions(root, tmp_path):
+    more = ["reward.bc_every=null", "demo.subsample=1", "steps=128"]
+    assert main(words("dril", tmp_path / "run", root, *more)) == 0
+    assert not any("bc/loss" in row for row in rows(tmp_path / "run"))
+
+
+def test_the_default_learner_is_off_policy(root, tmp_path):
+    for recipe in ("nearest", "mmd", "dril"):
+        assert main(words(recipe, tmp_path / recipe, root, "steps=64")) == 0
+        assert any(row["phase"] == "sac" for row in rows(tmp_path / recipe))
