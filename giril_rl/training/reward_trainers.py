@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
 import torch
@@ -118,7 +118,7 @@ class AdversarialTrainer:
         device = self.gradients.parameters[0].device
         loss.to(device)  # VAIL's beta as well, which is the loss's and not the reward's.
         self._device = device
-        self._expert = self._columns(expert)
+        self._expert = [column.contiguous() for column in self._columns(expert)]
         if loss.reward.absorbing is not None:
             place = self._keys.index(TERMINATED)
             self._expert[place] = torch.full((len(self._expert[0]), 1), terminal_rate).to(device)
@@ -139,7 +139,8 @@ class AdversarialTrainer:
         steps = self._due(len(policy[0]))
         with seeded(0, self._device):
             restore_rng(self._rng)
-            logs = [self._step(part) for part in self._minibatches(policy, steps)]
+            drawn = self._from_source(steps)
+            logs = [self._step(policy if part is None else part) for part in drawn]
             self._rng = rng_state(self._device)
         metrics = {
             f"discriminator/{name}": torch.stack([log[name] for log in logs]).mean().item()
@@ -157,21 +158,19 @@ class AdversarialTrainer:
         self._taken += transitions
         return self._taken * self.cfg.updates // self.cfg.every - before
 
-    def _minibatches(self, collected: list[Tensor], steps: int) -> Iterator[list[Tensor]]:
-        """The policy's part of ``steps`` minibatches."""
+    def _from_source(self, steps: int) -> Sequence[list[Tensor] | None]:
+        """The policy's part of ``steps`` minibatches; None for what the collected batch gives."""
         size, drawn = self.cfg.batch, None
         if self.source is not None and steps:
             drawn = self.source(steps * size)
         if drawn is None:
-            for _ in range(steps):
-                yield _drawn(collected, size)
-            return
-        for part in zip(*(x.split(size) for x in self._columns(drawn)), strict=True):
-            yield list(part)
+            return [None] * steps
+        columns = [column.split(size) for column in self._columns(drawn)]
+        return [list(part) for part in zip(*columns, strict=True)]
 
     def _step(self, policy: list[Tensor]) -> dict[str, Tensor]:
-        expert = _drawn(self._expert, self.cfg.batch)
-        log = self.gradients.step([*self._with_log_prob(expert), *self._with_log_prob(policy)])
+        sides = [_drawn(columns, self.cfg.batch) for columns in (self._expert, policy)]
+        log = self.gradients.step([x for side in sides for x in self._with_log_prob(side)])
         self.optimizer.step()
         self.loss.after_step(log)
         return log
@@ -182,7 +181,7 @@ class AdversarialTrainer:
         columns = [transitions.get(key) for key in self._keys]
         if dims != 1:
             columns = [column.flatten(0, dims - 1) for column in columns]
-        return [column.contiguous().to(self._device) for column in columns]
+        return [column.to(self._device) for column in columns]
 
     @torch.no_grad()
     def _with_log_prob(self, columns: list[Tensor]) -> list[Tensor]:
