@@ -12,7 +12,7 @@ from pathlib import Path
 import torch
 from torchrl.envs import Compose
 
-from giril_rl.config.schema import FitConfig, RewardRunConfig
+from giril_rl.config.schema import FitConfig, OffPolicyRunConfig
 from giril_rl.demos import holdout, subsample
 from giril_rl.envs import make_env
 from giril_rl.rewards.disagreement import BOOTSTRAP, bootstrapped
@@ -31,11 +31,12 @@ from giril_rl.transforms import IntrinsicReward
 
 
 @dataclass
-class Config(RewardRunConfig):
+class Config(OffPolicyRunConfig):
     """What `giril run dril` takes."""
 
     reward: DisagreementConfig = field(default_factory=DisagreementConfig)
-    fit: FitConfig = field(default_factory=FitConfig)
+    # Cloning's, as in the authors' code.
+    fit: FitConfig = field(default_factory=lambda: FitConfig(steps=10_000, batch=100, lr=2.5e-4))
 
 
 def main(cfg: Config, out: Path) -> None:

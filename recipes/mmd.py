@@ -10,7 +10,7 @@ from pathlib import Path
 
 from torchrl.envs import Compose
 
-from giril_rl.config.schema import RewardRunConfig
+from giril_rl.config.schema import OffPolicyRunConfig
 from giril_rl.demos import subsample
 from giril_rl.envs import make_env
 from giril_rl.rewards.mmd import MMDConfig, mmd_reward
@@ -27,7 +27,7 @@ from giril_rl.transforms import IntrinsicReward
 
 
 @dataclass
-class Config(RewardRunConfig):
+class Config(OffPolicyRunConfig):
     """What `giril run mmd` takes."""
 
     reward: MMDConfig = field(default_factory=MMDConfig)

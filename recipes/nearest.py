@@ -10,7 +10,7 @@ from pathlib import Path
 
 from torchrl.envs import Compose
 
-from giril_rl.config.schema import RewardRunConfig
+from giril_rl.config.schema import OffPolicyRunConfig
 from giril_rl.demos import subsample
 from giril_rl.envs import make_env
 from giril_rl.rewards.nearest import NearestConfig, nearest_neighbour
@@ -26,7 +26,7 @@ from giril_rl.transforms import IntrinsicReward
 
 
 @dataclass
-class Config(RewardRunConfig):
+class Config(OffPolicyRunConfig):
     """What `giril run nearest` takes."""
 
     reward: NearestConfig = field(default_factory=NearestConfig)

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from torchrl.envs import Compose
 
-from giril_rl.config.schema import RewardRunConfig
+from giril_rl.config.schema import OffPolicyRunConfig, ScalingConfig
 from giril_rl.demos import subsample
 from giril_rl.envs import make_env
 from giril_rl.rewards.pwil import PWILConfig, pwil_reward
@@ -27,9 +27,10 @@ from giril_rl.transforms import IntrinsicReward
 
 
 @dataclass
-class Config(RewardRunConfig):
+class Config(OffPolicyRunConfig):
     """What `giril run pwil` takes."""
 
+    scaling: ScalingConfig = field(default_factory=lambda: ScalingConfig(enabled=False))
     reward: PWILConfig = field(default_factory=PWILConfig)
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from torchrl.envs import Compose
 
-from giril_rl.config.schema import RewardRunConfig
+from giril_rl.config.schema import OffPolicyRunConfig, SACConfig, ScalingConfig
 from giril_rl.demos import subsample
 from giril_rl.envs import make_env
 from giril_rl.rewards.sinkhorn import SinkhornConfig, sinkhorn_reward
@@ -26,9 +26,12 @@ from giril_rl.transforms import IntrinsicReward
 
 
 @dataclass
-class Config(RewardRunConfig):
+class Config(OffPolicyRunConfig):
     """What `giril run sinkhorn` takes."""
 
+    # The first episode scales the reward; before that the demonstration itself has none.
+    sac: SACConfig = field(default_factory=lambda: SACConfig(demonstration="none"))
+    scaling: ScalingConfig = field(default_factory=lambda: ScalingConfig(enabled=False))
     reward: SinkhornConfig = field(default_factory=SinkhornConfig)
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from giril_rl.config.schema import RewardRunConfig, SACConfig, ScalingConfig, knob
+from giril_rl.config.schema import OffPolicyRunConfig, SACConfig, ScalingConfig
 from giril_rl.demos import subsample
 from giril_rl.envs import make_env
 from giril_rl.errors import UserError
@@ -24,18 +24,20 @@ from giril_rl.transforms import IntrinsicReward
 
 
 @dataclass
-class Config(RewardRunConfig):
+class Config(OffPolicyRunConfig):
     """What `giril run sqil` takes."""
 
-    algorithm: str = knob(
-        "sac", "SQIL needs a replay buffer, which PPO has not", choices=("ppo", "sac")
-    )
     sac: SACConfig = field(default_factory=lambda: SACConfig(demonstration="half"))
     scaling: ScalingConfig = field(default_factory=lambda: ScalingConfig(enabled=False))
     reward: SQILConfig = field(default_factory=SQILConfig)
 
     def check(self, prefix: str, run: object) -> None:
         """Refuses a learner without a replay, and a replay without the demonstration."""
+        if self.task.family.observation == "image":
+            raise UserError(
+                f"SQIL learns of vectors and {self.task.name} shows images, for which SAC has no "
+                "networks: choose another recipe."
+            )
         if self.algorithm != "sac":
             raise UserError(
                 f"algorithm={self.algorithm}: SQIL pays for transitions in a replay buffer, which "

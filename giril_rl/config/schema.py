@@ -392,14 +392,6 @@ class ExpertRunConfig(RunConfig):
     clip_reward: bool = knob(False, "learn from the reward's sign (Atari); scores are unclipped")
     scaling: ScalingConfig = field(default_factory=lambda: ScalingConfig(reset="done"))
 
-    def check(self, prefix: str, run: Any) -> None:
-        """Refuses another horizon than the task's own."""
-        if self.task.horizon != "own":
-            raise UserError(
-                f"task.horizon={self.task.horizon}: an expert plays the task as it is; leave "
-                "task.horizon=own."
-            )
-
 
 @dataclass
 class DemoRunConfig(RunConfig):
@@ -460,6 +452,19 @@ class RewardRunConfig(DemoRunConfig):
         """Seed of the reward model: ``reward.seed``, or the run's."""
         own = getattr(getattr(self, "reward", None), "seed", None)
         return self.seed if own is None else own
+
+
+@dataclass
+class OffPolicyRunConfig(RewardRunConfig):
+    """What recipes share whose reward asks for an off-policy learner and the whole demonstration.
+
+    On frames, for which SAC has no networks, the defaults of Atari tasks choose PPO.
+    """
+
+    algorithm: str = knob(
+        "sac", "what learns from the reward: on-policy or off-policy", choices=("ppo", "sac")
+    )
+    demo: DemoConfig = field(default_factory=lambda: DemoConfig(subsample=1))
 
 
 @dataclass

@@ -1,7 +1,7 @@
 """State-entropy bonus: a reward for states far from the others of the batch.
 
 ``b = log(1 + mean distance to the k nearest states of the batch)`` (APT: Liu and Abbeel 2021; ILDE:
-Yu et al. 2025, k = 12). Maximising it maximises a particle-based estimate of the entropy of the
+Zhao et al. 2025, k = 12). Maximising it maximises a particle-based estimate of the entropy of the
 states visited.
 """
 

@@ -47,6 +47,7 @@ class Method:
         scope: what the reward of a transition depends on besides the reward's own state: the
             "transition" alone, the whole "batch" that it is computed with, or the "trajectory" so
             far.
+        frames: whether it has a form for images.
         rank: its place in tables; those of equal rank are sorted by name.
     """
 
@@ -56,6 +57,7 @@ class Method:
     kind: Kind = "method"
     trained: Trained = "before"
     scope: Scope = "transition"
+    frames: bool = True
     demonstration: bool = True
     settings: type | None = None
     build: Callable[..., TensorDictModuleBase] | None = None

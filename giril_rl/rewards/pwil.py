@@ -295,5 +295,6 @@ register(
         settings=PWILConfig,
         build=pwil_reward,
         scope="trajectory",
+        frames=False,
     )
 )

@@ -298,5 +298,6 @@ register(
         settings=SinkhornConfig,
         build=sinkhorn_reward,
         scope="trajectory",
+        frames=False,
     )
 )

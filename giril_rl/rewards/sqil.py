@@ -44,4 +44,14 @@ def sqil_reward(
     return ConstantReward(settings.own)
 
 
-register(Method("sqil", "SQIL", GREY, trained="never", settings=SQILConfig, build=sqil_reward))
+register(
+    Method(
+        "sqil",
+        "SQIL",
+        GREY,
+        trained="never",
+        settings=SQILConfig,
+        build=sqil_reward,
+        frames=False,
+    )
+)

@@ -11,10 +11,10 @@ from giril_rl.config.schema import (
     TaskConfig,
 )
 from giril_rl.config.tasks import apply_task_defaults, task_defaults
-from giril_rl.methods import ControlRunConfig
+from giril_rl.methods import ControlRunConfig, methods
 
 PONG, PENDULUM = "ALE/Pong-v5", "Pendulum-v1"
-VECTORS_ALONE = ("pwil", "sinkhorn")
+VECTORS_ALONE = [name for name, method in methods().items() if not method.frames]
 RECIPES = [recipe.name for recipe in shipped() if recipe.name not in VECTORS_ALONE]
 
 

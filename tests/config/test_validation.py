@@ -7,7 +7,6 @@ from giril_rl.config.schema import (
     AveragedRunConfig,
     DemoConfig,
     ExpertConfig,
-    ExpertRunConfig,
     FitConfig,
     PPOConfig,
     RunConfig,
@@ -230,14 +229,6 @@ def test_steps_of_atari_s_expert_are_its_own_batches(steps, taken):
     batch = "is no multiple of a batch (8 * 128 = 1,024)"
     told = [f"expert.steps={steps} {batch}: {taken} steps are taken."] if taken else []
     assert notices(config) == told
-
-
-def test_an_expert_plays_the_task_as_it_is():
-    task = TaskConfig(name="reach", env_id="Reach-v0")
-    validate(ExpertRunConfig(task=task))
-    task.horizon = "fixed"
-    with pytest.raises(UserError, match=r"^task\.horizon=fixed: an expert .* task\.horizon=own\.$"):
-        validate(ExpertRunConfig(task=task))
 
 
 @pytest.mark.parametrize(
