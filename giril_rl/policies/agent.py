@@ -22,6 +22,8 @@ class Agent(Pretrained, nn.Module):
 
     acting_keys: Sequence[str]
     """What :meth:`act` returns, by name; the first is ``"action"``."""
+    samples_to_explore: bool = False
+    """Whether it is to be scored by its most likely actions, having sampled to explore alone."""
 
     @property
     def device(self) -> torch.device:

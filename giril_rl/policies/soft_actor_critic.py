@@ -51,6 +51,7 @@ class SACAgent(Agent):
     """
 
     acting_keys: tuple[str, ...] = ("action",)
+    samples_to_explore = True
 
     @remembered
     def __init__(

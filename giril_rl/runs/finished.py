@@ -120,7 +120,11 @@ def print_scores(folder: Path) -> None:
 
 
 def print_both(scores: dict[str, Any]) -> None:
-    """Print the scores of the sampled policy and, if there are any, of the deterministic one."""
+    """Print the scores of the policy as tables quote it and, if there are any, the others."""
+    if scores.get("sampled") is not None:
+        print(describe("deterministic", scores))
+        print(describe("sampled", scores["sampled"]))
+        return
     print(describe("sampled", scores))
     if scores.get("deterministic") is not None:  # Early versions have none.
         print(describe("deterministic", scores["deterministic"]))
@@ -187,7 +191,7 @@ _SECONDS_AND_RETURNS = (
 # Some kinds of runs, and runs of earlier versions, do not have these.
 _OPTIONAL: dict[str, Check] = {
     **dict.fromkeys(("seeds", "versions"), _is(dict)),
-    "deterministic": _or_none(_is(dict)),
+    **dict.fromkeys(("deterministic", "sampled"), _or_none(_is(dict))),
     **dict.fromkeys(("profile", "demo", "demo_id", "processor"), _or_none(_text)),
     **dict.fromkeys(_SECONDS_AND_RETURNS, _or_none(_number)),
     **dict.fromkeys(("inexact_resumes", "held_action"), _count),
@@ -208,8 +212,9 @@ def _first_wrong(result: dict[str, Any]) -> str | None:
         for key, value in result.get(part, {}).items():
             if not _or_none(check)(value):
                 return f"{part}.{key}" if _text(key) else part
-    mode = result.get("deterministic")
-    for key, check in _SCORES.items():
-        if mode is not None and not check(mode.get(key)):
-            return f"deterministic.{key}"
+    for name in ("deterministic", "sampled"):
+        other = result.get(name)
+        for key, check in _SCORES.items():
+            if other is not None and not check(other.get(key)):
+                return f"{name}.{key}"
     return None

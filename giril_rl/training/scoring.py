@@ -176,11 +176,13 @@ def _in_eval_mode(agent: Player) -> Iterator[None]:
 def evaluate_both(
     agent: Player, task: TaskConfig, *, episodes: int, seed: int
 ) -> dict[str, object]:
-    """Scores of the policy as it was trained, sampling; of its mode under ``"deterministic"``.
+    """Scores of the policy as tables quote it, and of the other way to play it.
 
-    The first are what tables quote: PPO maximises the return of the sampling policy, and the
-    paper's curves are of its training episodes. Where actions keep a standard deviation near 1, the
-    mode is a policy that was never tried. The entries are those of :class:`Scores`.
+    PPO's is sampled, and its mode is under ``"deterministic"``: PPO maximises the return of the
+    sampling policy, and the paper's curves are of its training episodes. Where actions keep a
+    standard deviation near 1, the mode is a policy that was never tried. SAC's is the mode, as is
+    usual (Haarnoja et al., 2018), for it samples for the sake of exploration; its samples are under
+    ``"sampled"``. The entries are those of :class:`Scores`.
     """
     scores = {
         deterministic: evaluate(
@@ -188,4 +190,7 @@ def evaluate_both(
         )
         for deterministic in (True, False)
     }
-    return {**scores[False].as_dict(), "deterministic": scores[True].as_dict()}
+    mode, sampled = scores[True].as_dict(), scores[False].as_dict()
+    if getattr(agent, "samples_to_explore", False):
+        return {**mode, "sampled": sampled}
+    return {**sampled, "deterministic": mode}

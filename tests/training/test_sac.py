@@ -11,7 +11,7 @@ from tensordict import TensorDict
 from torchrl.data import Bounded, Categorical, OneHot, Unbounded
 from torchrl.envs import Compose
 
-from giril_rl.config.schema import SACConfig
+from giril_rl.config.schema import SACConfig, TaskConfig
 from giril_rl.envs import GymVectorEnv
 from giril_rl.errors import UserError
 from giril_rl.policies import make_sac_agent
@@ -19,7 +19,7 @@ from giril_rl.policies.soft_actor_critic import SACAgent
 from giril_rl.rewards import DiscriminatorReward
 from giril_rl.runs.interrupt import Interrupted
 from giril_rl.runs.run import Run
-from giril_rl.training import SAC, train_policy
+from giril_rl.training import SAC, evaluate, evaluate_both, train_policy
 from giril_rl.transforms import IntrinsicReward
 from giril_rl.transforms.scaling import ReturnScaling
 
@@ -350,6 +350,16 @@ def test_a_saved_agent_plays_as_before(tmp_path):
     loaded = SACAgent.from_pretrained(agent.save_pretrained(tmp_path / "p"))
     x = torch.randn(7, 4)
     assert torch.equal(loaded.act(x, greedy=True)[0], agent.act(x, greedy=True)[0])
+
+
+def test_its_score_is_that_of_the_mean_action():
+    task = TaskConfig(name="pendulum", env_id="Pendulum-v1", max_episode_steps=20)
+    agent = SACAgent(3, Bounded(-2, 2, shape=(1,)), hidden=[8])
+    both = evaluate_both(agent, task, episodes=3, seed=0)
+    for scores, mode in ((both, True), (both["sampled"], False)):
+        alone = evaluate(agent, task, episodes=3, seed=0, deterministic=mode, show_progress=False)
+        assert scores["returns"] == alone.returns
+    assert both["returns"] != both["sampled"]["returns"]
 
 
 @pytest.mark.parametrize(
