@@ -2,6 +2,8 @@
 
 from giril_rl.rewards.actions import ActionEncoder
 from giril_rl.rewards.adversarial import (
+    DiscriminatorConfig,
+    DiscriminatorScaling,
     RewardForm,
     adversarial_reward,
     discriminator_loss,
@@ -30,10 +32,8 @@ from giril_rl.rewards.curiosity import (
 )
 from giril_rl.rewards.discriminator import (
     AdversarialConfig,
-    DiscriminatorConfig,
     DiscriminatorLoss,
     DiscriminatorReward,
-    DiscriminatorScaling,
     discriminator_reward,
 )
 from giril_rl.rewards.factored import factored_error

@@ -22,14 +22,17 @@ from giril_rl.errors import UserError
 from giril_rl.networks.pixels import SIDE, PixelBottleneck
 from giril_rl.networks.vectors import mlp
 from giril_rl.rewards.actions import ActionEncoder
-from giril_rl.rewards.adversarial import RewardForm, dual_step
+from giril_rl.rewards.adversarial import (
+    DiscriminatorScaling,
+    RewardForm,
+    discriminator_scaler,
+    dual_step,
+)
 from giril_rl.rewards.discriminator import (
     AdversarialConfig,
     DiscriminatorLoss,
     DiscriminatorReward,
-    DiscriminatorScaling,
     Sets,
-    discriminator_scaler,
 )
 from giril_rl.rewards.generative import gaussian_kl
 from giril_rl.rewards.method import PINK, Method, register
