@@ -13,6 +13,7 @@ from giril_rl.rewards.bottleneck import (
     BottleneckConfig,
     BottleneckLoss,
     BottleneckReward,
+    bottleneck_loss,
     bottleneck_reward,
 )
 from giril_rl.rewards.controls import (
@@ -95,6 +96,7 @@ __all__ = [
     "action_term",
     "adversarial_reward",
     "blend_action",
+    "bottleneck_loss",
     "bottleneck_reward",
     "copy_reward",
     "curiosity_reward",

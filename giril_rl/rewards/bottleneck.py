@@ -260,6 +260,24 @@ def bottleneck_reward(
     return reward
 
 
+def bottleneck_loss(reward: BottleneckReward, settings: BottleneckConfig) -> BottleneckLoss:
+    """VAIL's loss, as its settings have it.
+
+    Examples:
+        >>> from torchrl.data import Categorical
+        >>> reward = BottleneckReward.for_vectors(2, Categorical(3), normalise="raw")
+        >>> bottleneck_loss(reward, BottleneckConfig(beta_start=0.5)).beta
+        tensor(0.5000)
+    """
+    return BottleneckLoss(
+        reward,
+        information=settings.information,
+        beta_step=settings.beta_step,
+        beta=settings.beta_start,
+        penalty=settings.penalty,
+    )
+
+
 register(
     Method(
         "vail",
@@ -268,13 +286,7 @@ register(
         trained="beside",
         settings=BottleneckConfig,
         build=bottleneck_reward,
-        loss=lambda reward, settings: BottleneckLoss(
-            reward,
-            information=settings.information,
-            beta_step=settings.beta_step,
-            beta=settings.beta_start,
-            penalty=settings.penalty,
-        ),
+        loss=bottleneck_loss,
         rank=3,
     )
 )
