@@ -31,7 +31,7 @@ from giril_rl.rewards.discriminator import (
     DiscriminatorScaling,
     discriminator_scaler,
 )
-from giril_rl.rewards.method import GREY, Method, register
+from giril_rl.rewards.method import SKY, Method, register
 from giril_rl.rewards.scaler import ObservationScaler, PixelScaler
 from giril_rl.rewards.transitions import (
     REWARD_KEYS,
@@ -413,7 +413,7 @@ register(
     Method(
         "airl",
         "AIRL",
-        GREY,
+        SKY,
         trained="beside",
         settings=AIRLConfig,
         build=airl_reward,

@@ -22,7 +22,7 @@ from torchrl.envs import EnvBase
 from giril_rl.config.schema import USE_ACTIONS, knob
 from giril_rl.errors import UserError
 from giril_rl.rewards.atoms import Atoms, check_vectors, spaces_of
-from giril_rl.rewards.method import GREY, Method, register
+from giril_rl.rewards.method import SKY, Method, register
 from giril_rl.rewards.trajectory import TrajectoryReward
 from giril_rl.rewards.transitions import REWARD_KEYS
 from giril_rl.runs.pretrained import remembered
@@ -293,7 +293,7 @@ register(
     Method(
         "sinkhorn",
         "Sinkhorn",
-        GREY,
+        SKY,
         trained="never",
         settings=SinkhornConfig,
         build=sinkhorn_reward,

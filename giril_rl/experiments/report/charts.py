@@ -20,6 +20,8 @@ from giril_rl.runs.curve import curve_points, new_figure, save, thousands
 BINS = 50
 LEGEND = 70  # Characters in a line of a legend.
 DASHED, DOTTED = (0, (6, 3)), (0, (1, 1))
+MOST = 8
+"""Lines in one part of a picture of many; :data:`PALETTE` has as many colours."""
 Part = tuple[str, list[tuple[Row, str, Look]]]
 """A part of a picture: its title, and its rows with their labels and looks."""
 
@@ -65,8 +67,9 @@ def _grid(parts: int, width: float, height: float, *, extra: float, **shared: An
 
 def _bar(axes: Any, place: int, row: Row, mean: Estimate) -> None:
     colour = GREY if row.is_control else row.look.color
-    hatch = "///" if row.profile == "paper" else None
-    axes.barh(place, mean.value, color=colour, alpha=0.85, hatch=hatch, height=0.7)
+    hatch = "///" if row.profile == "paper" else ""
+    hatch += ".." if row.beside_sac and row.algorithm == "ppo" else ""
+    axes.barh(place, mean.value, color=colour, alpha=0.85, hatch=hatch or None, height=0.7)
     if mean.low is not None and mean.high is not None:
         axes.plot([mean.low, mean.high], [place, place], color="black", linewidth=1.4, marker="|")
     # Beside the axes, where no line crosses the number.
@@ -121,17 +124,68 @@ def row_curves(row: Row, bins: int = BINS) -> tuple[np.ndarray, np.ndarray] | No
     return ((np.arange(bins) + 1) * steps / bins)[kept], curves[:, kept]
 
 
-def draw_results(table: Table, path: Path) -> bool:
-    """Write the PNG of a task's learning curves, controls on the right; False if there is none."""
-    parts: dict[str, list[tuple[Row, str, Look]]] = {"methods": [], "controls": []}
-    for row in longest(line.row for line in table.lines):
-        part = parts["controls" if row.is_control else "methods"]
-        part.append((row, row.name.removeprefix("control: "), row.look))
-    return _draw_curves(table.panel, [part for part in parts.items() if part[1]], path)
+def draw_results(table: Table, path: Path) -> list[Path]:
+    """Write the PNG of a task's learning curves, controls on the right; empty if there is none.
+
+    Where runs have SAC, or more than 8 methods are drawn, a part has at most 8 lines and each
+    method of a part its own colour. More than 8 rows then take two pictures: the second, of
+    controls, is named ``-controls.png``.
+    """
+    rows = longest(line.row for line in table.lines)
+    kinds = {
+        "methods": [row for row in rows if not row.is_control],
+        "controls": [row for row in rows if row.is_control],
+    }
+    kinds = {name: each for name, each in kinds.items() if each}
+    if not table.panel.has_sac and len(kinds.get("methods", [])) <= MOST:
+        parts = [(name, [_labelled(row) for row in each]) for name, each in kinds.items()]
+        return [path] if _draw_curves(table.panel, parts, path) else []
+    split = {name: _parts(name, each) for name, each in kinds.items()}
+    if len(rows) <= MOST:
+        every = [part for parts in split.values() for part in parts]
+        return [path] if _draw_curves(table.panel, every, path) else []
+    paths = {"methods": path, "controls": path.with_stem(f"{path.stem}-controls")}
+    return [
+        paths[name] for name, part in split.items() if _draw_curves(table.panel, part, paths[name])
+    ]
 
 
-def draw_varied(table: Table, path: Path) -> bool:
-    """Write the PNG of an ablation's learning curves; False if there is none.
+def _labelled(row: Row) -> tuple[Row, str, Look]:
+    return row, row.name.removeprefix("control: "), row.look
+
+
+def _parts(kind: str, rows: Sequence[Row]) -> list[Part]:
+    """The rows in parts of at most 8 lines, about equally many, with those of a method together."""
+    count = -(-len(rows) // MOST)
+    most = -(-len(rows) // count)
+    parts: list[list[Row]] = [[]]
+    for method in dict.fromkeys(row.method for row in rows):
+        same = [row for row in rows if row.method == method]
+        if parts[-1] and len(parts[-1]) + len(same) > most:
+            parts.append([])
+        parts[-1] += same
+    titles = [f"{kind}, {i} of {len(parts)}" for i in range(1, len(parts) + 1)]
+    return [
+        (title if len(parts) > 1 else kind, _told_apart(part))
+        for title, part in zip(titles, parts, strict=True)
+    ]
+
+
+def _told_apart(rows: Sequence[Row]) -> list[tuple[Row, str, Look]]:
+    """The rows with their looks, but for methods whose colour one before them has already."""
+    colours: dict[str, str] = {}
+    for row in rows:
+        if row.look.color not in colours.values():
+            colours.setdefault(row.method, row.look.color)
+    for row in rows:
+        free = [color for color in PALETTE if color not in colours.values()]
+        colours.setdefault(row.method, next(iter(free), row.look.color))
+    labelled = [_labelled(row) for row in rows]
+    return [(row, name, look._replace(color=colours[row.method])) for row, name, look in labelled]
+
+
+def draw_varied(table: Table, path: Path) -> list[Path]:
+    """Write the PNG of an ablation's learning curves; empty if there is none.
 
     It has a part for each method and a line for each value, with the same colour in all parts.
     """
@@ -144,7 +198,8 @@ def draw_varied(table: Table, path: Path) -> bool:
         color = PALETTE[len(looks) % len(PALETTE)]
         style = looks.setdefault(label, Look(color, "-" if len(looks) < len(PALETTE) else "--"))
         parts.setdefault(line.row.name, []).append((line.row, label, style))
-    return _draw_curves(table.panel, list(parts.items()), path, about=f": {table.title}")
+    about = f": {table.title}"
+    return [path] if _draw_curves(table.panel, list(parts.items()), path, about) else []
 
 
 def _draw_curves(panel: Panel, parts: Sequence[Part], path: Path, about: str = "") -> bool:
