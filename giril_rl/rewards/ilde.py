@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from giril_rl.config.schema import knob
 from giril_rl.errors import UserError
-from giril_rl.rewards.method import BLUE, Method, register
+from giril_rl.rewards.method import RED, Method, register
 from giril_rl.rewards.transitions import REWARD_KEYS
 
 
@@ -151,4 +151,4 @@ class InMinibatches(TensorDictModuleBase):
         return tensordict.set(self.out_keys[0], torch.cat(computed))
 
 
-register(Method("ilde", "ILDE", BLUE, trained="beside", settings=ILDEConfig))
+register(Method("ilde", "ILDE", RED, trained="beside", settings=ILDEConfig))

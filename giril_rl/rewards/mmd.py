@@ -17,7 +17,7 @@ from torchrl.envs import EnvBase
 
 from giril_rl.config.schema import USE_ACTIONS, knob
 from giril_rl.errors import UserError
-from giril_rl.rewards.method import GREEN, Method, register
+from giril_rl.rewards.method import BLUE, Method, register
 from giril_rl.rewards.points import (
     CLAMP,
     USE_NEXT,
@@ -287,7 +287,7 @@ register(
     Method(
         "mmd",
         "GMMIL",
-        GREEN,
+        BLUE,
         trained="beside",
         settings=MMDConfig,
         build=mmd_reward,

@@ -32,7 +32,8 @@ def draw_bars(panels: Sequence[Panel], path: Path) -> bool:
     if not found:
         return False
     most = max(len(rows) for _, rows in found)
-    figure, grid, columns = _grid(len(found), 5.4, 1.3 + 0.32 * most, extra=0.7)
+    width = 7.0 if any(panel.has_sac for panel, _ in found) else 5.4  # Names are longer.
+    figure, grid, columns = _grid(len(found), width, 1.3 + 0.32 * most, extra=0.7)
     for axes, (panel, rows) in zip(grid, found, strict=True):
         for end, style in ((0.0, DOTTED), (1.0, DASHED)):
             axes.axvline(end, color=BLACK, linestyle=style, linewidth=1.2, zorder=1)
@@ -54,9 +55,11 @@ def draw_bars(panels: Sequence[Panel], path: Path) -> bool:
     return True
 
 
-def _grid(parts: int, width: float, height: float, *, extra: float, **shared: Any) -> Any:
+def _grid(
+    parts: int, width: float, height: float, *, extra: float, most: int = 3, **shared: Any
+) -> Any:
     """A figure with axes for each part, and its number of columns."""
-    columns = 2 if parts == 4 and shared else min(parts, 3)
+    columns = 2 if parts == 4 and shared else min(parts, most)
     lines = -(-parts // columns)
     figure = new_figure(width * columns, height * lines + extra)
     grid = figure.subplots(lines, columns, squeeze=False, **shared).flatten()
@@ -143,10 +146,12 @@ def draw_results(table: Table, path: Path) -> list[Path]:
     split = {name: _parts(name, each) for name, each in kinds.items()}
     if len(rows) <= MOST:
         every = [part for parts in split.values() for part in parts]
-        return [path] if _draw_curves(table.panel, every, path) else []
+        return [path] if _draw_curves(table.panel, every, path, columns=2) else []
     paths = {"methods": path, "controls": path.with_stem(f"{path.stem}-controls")}
     return [
-        paths[name] for name, part in split.items() if _draw_curves(table.panel, part, paths[name])
+        paths[name]
+        for name, each in split.items()
+        if _draw_curves(table.panel, each, paths[name], columns=2)
     ]
 
 
@@ -202,7 +207,9 @@ def draw_varied(table: Table, path: Path) -> list[Path]:
     return [path] if _draw_curves(table.panel, list(parts.items()), path, about) else []
 
 
-def _draw_curves(panel: Panel, parts: Sequence[Part], path: Path, about: str = "") -> bool:
+def _draw_curves(
+    panel: Panel, parts: Sequence[Part], path: Path, about: str = "", columns: int = 3
+) -> bool:
     rows = [row for _, lines in parts for row, _, _ in lines]
     curves = {id(row): row_curves(row) for row in rows}
     if not any(curves.values()):
@@ -211,7 +218,9 @@ def _draw_curves(panel: Panel, parts: Sequence[Part], path: Path, about: str = "
     ncols = 1 if max(len(label) for part in labels for label in part) > 36 else 2
     entries = max(sum(len(wrap(label, LEGEND)) for label in part) for part in labels) + 2
     height = 4.6 + 0.2 * -(-entries // ncols)
-    figure, grid, columns = _grid(len(parts), 6.2, height, extra=0.4, sharex=True, sharey=True)
+    figure, grid, columns = _grid(
+        len(parts), 6.2, height, extra=0.4, most=columns, sharex=True, sharey=True
+    )
     for axes, (title, lines) in zip(grid, parts, strict=True):
         for row, label, style in lines:
             _line(axes, row, curves[id(row)], label, style)

@@ -47,16 +47,16 @@ def _table(panel: Panel, steps: int, pairs: list[dict[str, Row]]) -> str:
     learned = [row for pair in pairs for row in pair.values() if row.is_learned]
     best = max(round(row.estimates[0].value, 1) for row in learned)
     lines = [
-        {"reward": pair["ppo"].name_of_both, **{key: _cell(row, best) for key, row in pair.items()}}
+        {"reward": pair["ppo"].name_of_both} | {key: _cell(row, best) for key, row in pair.items()}
         for pair in pairs
     ]
     lines.append({"reward": "best control", **{key: _control(controls[key]) for key in ALGORITHMS}})
     rows = [row for pair in pairs for row in pair.values()]
     rows += [row for row in controls.values() if row is not None]
     text = (
-        f"The same rewards with either learner after {steps:,} environment steps ({seeds_text(rows)}"
-        "; mean score with its 95% interval): what the reward does shows between rows, what the "
-        "learner does between columns.\n"
+        f"Mean scores of the same rewards with either learner after {steps:,} environment steps, "
+        f"{seeds_text(rows)}, with 95% intervals: compare rows to see what the reward does, and "
+        "columns to see what the learner does.\n"
     )
     return f"{text}\n{markdown([_titled(line) for line in lines])}"
 

@@ -29,7 +29,7 @@ from giril_rl.training.baselines import RANDOM
 from giril_rl.training.result import score_over_demonstration
 
 STYLES = ("-", "--", "-.", ":")
-DOTS = ((0, (1, 1.2)), (0, (1, 3)), (0, (4, 1, 1, 1)), (0, (4, 1, 1, 1, 1, 1)))
+DOTS = ((0, (1, 1)), (0, (5, 1.5, 1, 1.5)), (0, (1, 2.5)), (0, (5, 1.5, 1, 1.5, 1, 1.5)))
 """The line styles of PPO's rows beside those of SAC, in the order of ``STYLES``."""
 
 
