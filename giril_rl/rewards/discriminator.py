@@ -90,7 +90,7 @@ class AdversarialConfig(DiscriminatorConfig):
     )
     use_actions: bool = knob(True, USE_ACTIONS)
     absorbing: bool | None = knob(
-        None, "a failure leads to an absorbing state, which is rewarded too; null: off-policy only"
+        None, "a failure leads to an absorbing state, which is rewarded too; null: with SAC alone"
     )
 
     def check(self, prefix: str, run: object) -> None:
