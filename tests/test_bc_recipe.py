@@ -40,6 +40,7 @@ def run(out, root, *words):
 def test_it_leaves_a_whole_result(task, root, tmp_path, capsys):
     result = run(tmp_path / "run", root, task)
     assert result["method"] == "bc" and result["env_steps"] == 0
+    assert result["algorithm"] is None
     assert result["steps_per_second"] == 0 and result["wall_seconds"] > 0
     assert result["demo_transitions"] == 100
     assert math.isfinite(result["expert_return_mean"] + result["demo_return_mean"])

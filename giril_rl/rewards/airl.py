@@ -34,7 +34,7 @@ from giril_rl.rewards.adversarial import (
     gradient_penalty,
     interpolated,
 )
-from giril_rl.rewards.method import GREY, Method, register
+from giril_rl.rewards.method import SKY, Method, register
 from giril_rl.rewards.scaler import PixelScaler
 from giril_rl.rewards.transitions import (
     REWARD_KEYS,
@@ -402,7 +402,7 @@ register(
     Method(
         "airl",
         "AIRL",
-        GREY,
+        SKY,
         trained="beside",
         settings=AIRLConfig,
         build=airl_reward,

@@ -34,7 +34,7 @@ from giril_rl.rewards.disagreement import (
     state_variance,
 )
 from giril_rl.rewards.fitting import Reduction, TransitionLoss
-from giril_rl.rewards.method import GREY, Method, register
+from giril_rl.rewards.method import ORANGE, Method, register
 from giril_rl.rewards.scaler import ObservationScaler, PixelScaler, ScalingRule
 from giril_rl.rewards.transitions import (
     PAIR_KEYS,
@@ -349,7 +349,7 @@ register(
     Method(
         "dril",
         "DRIL",
-        GREY,
+        ORANGE,
         settings=DisagreementConfig,
         build=dril_reward,
         loss=lambda reward, settings: DisagreementLoss(reward),

@@ -28,7 +28,7 @@ from giril_rl.rewards.discriminator import (
 )
 from giril_rl.rewards.entropy_bonus import EntropyBonusConfig, entropy_bonus
 from giril_rl.rewards.generative import GenerativeConfig, generative_reward
-from giril_rl.rewards.method import GREY, Method, register
+from giril_rl.rewards.method import RED, Method, register
 from giril_rl.rewards.pwil import PWILConfig, pwil_reward
 from giril_rl.rewards.transitions import REWARD_KEYS
 
@@ -272,4 +272,4 @@ def imitation_loss(reward: Any, settings: AdversarialConfig) -> DiscriminatorLos
     return DiscriminatorLoss(reward, penalty=settings.penalty)
 
 
-register(Method("ilde", "ILDE", GREY, trained="beside", settings=ILDEConfig))
+register(Method("ilde", "ILDE", RED, trained="beside", settings=ILDEConfig))

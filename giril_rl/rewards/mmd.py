@@ -17,7 +17,7 @@ from torchrl.envs import EnvBase
 
 from giril_rl.config.schema import USE_ACTIONS, knob
 from giril_rl.errors import UserError
-from giril_rl.rewards.method import GREY, Method, register
+from giril_rl.rewards.method import BLUE, Method, register
 from giril_rl.rewards.point_reward import CLAMP, USE_NEXT, PointReward, point_reward_for
 from giril_rl.rewards.points import in_parts, median_distance
 from giril_rl.rewards.transitions import read
@@ -281,7 +281,7 @@ register(
     Method(
         "mmd",
         "GMMIL",
-        GREY,
+        BLUE,
         trained="beside",
         settings=MMDConfig,
         build=mmd_reward,

@@ -16,7 +16,7 @@ from torchrl.envs import EnvBase
 
 from giril_rl.config.schema import USE_ACTIONS, knob
 from giril_rl.errors import UserError
-from giril_rl.rewards.method import GREY, Method, register
+from giril_rl.rewards.method import PINK, Method, register
 from giril_rl.rewards.point_reward import CLAMP, USE_NEXT, PointReward, point_reward_for
 from giril_rl.rewards.points import EXACT, in_parts, median_distance
 
@@ -157,7 +157,7 @@ register(
     Method(
         "nearest",
         "Nearest neighbour",
-        GREY,
+        PINK,
         trained="never",
         settings=NearestConfig,
         build=nearest_neighbour,

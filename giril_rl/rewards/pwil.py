@@ -20,7 +20,7 @@ from torchrl.envs import EnvBase
 
 from giril_rl.config.schema import USE_ACTIONS, knob
 from giril_rl.errors import UserError
-from giril_rl.rewards.method import SKY, Method, register
+from giril_rl.rewards.method import GREEN, Method, register
 from giril_rl.rewards.points import Atoms
 from giril_rl.rewards.trajectory import TrajectoryReward, check_vectors, spaces_of
 from giril_rl.rewards.transitions import REWARD_KEYS
@@ -290,7 +290,7 @@ register(
     Method(
         "pwil",
         "PWIL",
-        SKY,
+        GREEN,
         trained="never",
         settings=PWILConfig,
         build=pwil_reward,

@@ -24,7 +24,7 @@ from giril_rl.networks.pixels import FEATURES, PixelFeatures
 from giril_rl.networks.vectors import mlp
 from giril_rl.rewards.actions import ActionEncoder
 from giril_rl.rewards.fitting import TransitionLoss
-from giril_rl.rewards.method import GREY, Method, register
+from giril_rl.rewards.method import RED, Method, register
 from giril_rl.rewards.scaler import ObservationScaler, PixelScaler, ScalingRule
 from giril_rl.rewards.transitions import (
     PAIR_KEYS,
@@ -343,7 +343,7 @@ register(
     Method(
         "red",
         "RED",
-        GREY,
+        RED,
         settings=DistillationConfig,
         build=red_reward,
         loss=lambda reward, settings: DistillationLoss(reward),

@@ -21,7 +21,7 @@ from torchrl.envs import EnvBase
 
 from giril_rl.config.schema import USE_ACTIONS, knob
 from giril_rl.errors import UserError
-from giril_rl.rewards.method import GREY, Method, register
+from giril_rl.rewards.method import SKY, Method, register
 from giril_rl.rewards.points import EXACT, Atoms
 from giril_rl.rewards.trajectory import TrajectoryReward, check_vectors, spaces_of
 from giril_rl.rewards.transitions import REWARD_KEYS
@@ -293,7 +293,7 @@ register(
     Method(
         "sinkhorn",
         "Sinkhorn",
-        GREY,
+        SKY,
         trained="never",
         settings=SinkhornConfig,
         build=sinkhorn_reward,

@@ -15,7 +15,7 @@ from torchrl.envs import EnvBase
 from giril_rl.config.schema import knob
 from giril_rl.errors import UserError
 from giril_rl.rewards.controls import ConstantReward
-from giril_rl.rewards.method import GREY, Method, register
+from giril_rl.rewards.method import ORANGE, Method, register
 
 
 @dataclass
@@ -73,7 +73,7 @@ register(
     Method(
         "sqil",
         "SQIL",
-        GREY,
+        ORANGE,
         trained="never",
         settings=SQILConfig,
         build=sqil_reward,

@@ -186,13 +186,13 @@ _NEEDED: dict[str, Check] = {
 }
 _SECONDS_AND_RETURNS = (
     *("wall_seconds", "fit_seconds", "steps_per_second"),
-    *("life_length_mean", "expert_return_mean", "demo_return_mean"),
+    *("life_length_mean", "expert_return_mean", "demo_return_mean", "score_over_demo"),
 )
 # Some kinds of runs, and runs of earlier versions, do not have these.
 _OPTIONAL: dict[str, Check] = {
     **dict.fromkeys(("seeds", "versions"), _is(dict)),
     **dict.fromkeys(("deterministic", "sampled"), _or_none(_is(dict))),
-    **dict.fromkeys(("profile", "demo", "demo_id", "processor"), _or_none(_text)),
+    **dict.fromkeys(("profile", "algorithm", "demo", "demo_id", "processor"), _or_none(_text)),
     **dict.fromkeys(_SECONDS_AND_RETURNS, _or_none(_number)),
     **dict.fromkeys(("inexact_resumes", "held_action"), _count),
     **dict.fromkeys(("demo_transitions", "demo_pairs"), _or_none(_count)),

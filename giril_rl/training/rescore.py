@@ -23,6 +23,7 @@ from giril_rl.runs.finished import (
     read_settings,
 )
 from giril_rl.training.baselines import HELD_ACTION, RANDOM, HeldAction, RandomPolicy
+from giril_rl.training.result import score_over_demonstration
 from giril_rl.training.scoring import Player, evaluate_both
 
 
@@ -86,7 +87,9 @@ def score_anew(folder: Path, settings: EvalConfig) -> None:
             text = yaml.safe_dump({**config, "eval": asdict(settings)}, sort_keys=False)
             write_atomically(folder / "config.yaml", text)
             seeds = {**result.get("seeds", {}), "evaluation": settings.seed}
-            write_json(folder / "result.json", {**result, **scores, "seeds": seeds})
+            over = score_over_demonstration(scores["return_mean"], result.get("demo_return_mean"))
+            anew = {**result, **scores, "score_over_demo": over, "seeds": seeds}
+            write_json(folder / "result.json", anew)
     except Timeout:
         raise UserError(f"{folder} is in use by another process: wait for it to end.") from None
 

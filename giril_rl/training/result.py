@@ -73,11 +73,12 @@ def finish_run(
     scores = evaluate_both(agent, cfg.task, episodes=cfg.eval.episodes, seed=cfg.eval.seed)
     if seeds is None and reward is not None and isinstance(cfg, RewardRunConfig):
         seeds = {"reward": cfg.reward_seed}
-    has_score = demo is not None and demo.has_rewards
+    demonstrated = demo.mean_return() if demo is not None and demo.has_rewards else None
     result: dict[str, Any] = {
         "method": method_name(run.recipe, cfg),
         "task": cfg.task.name,
         "profile": _profile(cfg, trained),
+        "algorithm": cfg.algorithm if trained.steps else None,
         "horizon": cfg.task.horizon,
         "termination": getattr(cfg, "termination", "ends"),
         "seed": cfg.seed,
@@ -94,7 +95,8 @@ def finish_run(
         "inexact_resumes": trained.inexact_resumes,
         "steps_per_second": trained.steps / max(trained.seconds, 1e-9),
         "expert_return_mean": None if expert is None else expert["return_mean"],
-        "demo_return_mean": demo.mean_return() if demo is not None and has_score else None,
+        "demo_return_mean": demonstrated,
+        "score_over_demo": score_over_demonstration(scores["return_mean"], demonstrated),
         "demo": None if demo is None else _source(cfg, demo),
         "demo_id": None if demo is None else demo.demo_id,
         "demo_transitions": None if demo is None else len(demo),
@@ -112,6 +114,22 @@ def finish_run(
     _draw(run, result)
     run.finish(result)
     return result
+
+
+def score_over_demonstration(score: float, demonstration: float | None) -> float | None:
+    """A score divided by the demonstration's return; None where the quotient would mislead.
+
+    That is where the return is unknown or not above zero, and where the score is negative.
+
+    Examples:
+        >>> score_over_demonstration(600.0, 800.0), score_over_demonstration(0.0, 800.0)
+        (0.75, 0.0)
+        >>> score_over_demonstration(-5.0, 800.0), score_over_demonstration(-5.0, -10.0)
+        (None, None)
+    """
+    if demonstration is None or demonstration <= 0 or score < 0:
+        return None
+    return score / demonstration
 
 
 def _untrained(agent: nn.Module) -> dict[str, Any]:

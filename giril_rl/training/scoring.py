@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager, nullcontext
 from dataclasses import asdict, dataclass
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import torch
 from tensordict import TensorDictBase
@@ -173,9 +173,7 @@ def _in_eval_mode(agent: Player) -> Iterator[None]:
             module.training = True
 
 
-def evaluate_both(
-    agent: Player, task: TaskConfig, *, episodes: int, seed: int
-) -> dict[str, object]:
+def evaluate_both(agent: Player, task: TaskConfig, *, episodes: int, seed: int) -> dict[str, Any]:
     """Scores of the policy as tables quote it, and of the other way to play it.
 
     PPO's is sampled, and its mode is under ``"deterministic"``: PPO maximises the return of the

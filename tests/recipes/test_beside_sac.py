@@ -49,6 +49,8 @@ def test_a_recipe_leaves_a_whole_result(recipe, root, tmp_path):
     assert run(recipe, tmp_path / "run", root) == 0
     result = json.loads((tmp_path / "run" / "result.json").read_text())
     assert result["method"] == recipe and math.isfinite(result["return_mean"])
+    ratio = result["return_mean"] / result["demo_return_mean"]
+    assert (result["algorithm"], result["score_over_demo"]) == ("sac", ratio)
     rows = [
         row for row in read_metrics(tmp_path / "run" / "metrics.jsonl") if row["phase"] == "sac"
     ]

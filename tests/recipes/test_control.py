@@ -32,6 +32,7 @@ RESULT = {
     *("return_median", "episode_length_mean", "episodes", "returns", "deterministic"),
     *("wall_seconds", "fit_seconds", "steps_per_second", "expert_return_mean", "demo_return_mean"),
     *("demo_transitions", "config_hash", "versions", "finished_at"),
+    *("algorithm", "score_over_demo"),
 }
 
 
@@ -86,6 +87,7 @@ def test_each_control_leaves_a_whole_result(reward, root, tmp_path):
     assert result.keys() >= RESULT
     assert result["method"] == f"control:{reward}"
     assert result["env_steps"] == (0 if reward in UNTRAINED else 256)
+    assert result["algorithm"] == (None if reward in UNTRAINED else "ppo")
     needs_demo = reward not in ("constant", *UNTRAINED)
     assert result["demo_transitions"] == (100 if needs_demo else None)
     assert (result["expert_return_mean"] is not None) == needs_demo

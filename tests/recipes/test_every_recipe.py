@@ -59,7 +59,7 @@ FIELDS = [
     *("method", "task", "seed", "env_steps", *SCORES),
     *("wall_seconds", "fit_seconds", "steps_per_second"),
     *("expert_return_mean", "demo_return_mean", "demo_transitions", "config_hash", "versions"),
-    "finished_at",
+    *("algorithm", "score_over_demo", "finished_at"),
 ]
 
 
@@ -130,9 +130,11 @@ def test_a_recipe_leaves_a_whole_result(recipe, root, tmp_path, capsys):
     assert f"{result['return_mean']:,.1f}" in printed
     if recipe in ("expert", "control"):
         keys = ("expert_return_mean", "demo_return_mean", "demo_transitions")
-        assert [result[key] for key in keys] == [None] * 3
+        assert [result[key] for key in (*keys, "score_over_demo")] == [None] * 4
     else:
         assert result["demo_transitions"] == 100
+        ratio = result["return_mean"] / result["demo_return_mean"]
+        assert (result["algorithm"], result["score_over_demo"]) == ("ppo", ratio)
         assert math.isfinite(result["expert_return_mean"]) and result["demo_return_mean"] > 5
         expert = json.loads(next(root.glob("expert/*/*/result.json")).read_text())
         assert result["expert_return_mean"] == expert["return_mean"]

@@ -36,6 +36,11 @@ def caption(table: Table) -> str:
         parts.append(f"Scores of the {f'{words} and of the {last}' if others else last}.")
     if table.name == "results" or not panel.main:
         parts.append(what_is_missing(panel))
+    if any(line.over_demonstration for line in table.lines):
+        parts.append(
+            "Over demonstration: the score divided by the return of that seed's demonstration; "
+            "empty where a seed's score is negative or its demonstration's return not above zero."
+        )
     controls = [line.improvement[1] for line in table.lines if line.improvement]
     if controls:
         names = {f"{row.name.removeprefix('control: ')} ({steps_text(row)})" for row in controls}

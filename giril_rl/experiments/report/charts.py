@@ -20,6 +20,8 @@ from giril_rl.runs.curve import curve_points, new_figure, save, thousands
 BINS = 50
 LEGEND = 70  # Characters in a line of a legend.
 DASHED, DOTTED = (0, (6, 3)), (0, (1, 1))
+MOST = 8
+"""Lines in one part of a picture of many; :data:`PALETTE` has as many colours."""
 Part = tuple[str, list[tuple[Row, str, Look]]]
 """A part of a picture: its title, and its rows with their labels and looks."""
 
@@ -30,7 +32,8 @@ def draw_bars(panels: Sequence[Panel], path: Path) -> bool:
     if not found:
         return False
     most = max(len(rows) for _, rows in found)
-    figure, grid, columns = _grid(len(found), 5.4, 1.3 + 0.32 * most, extra=0.7)
+    width = 7.0 if any(panel.has_sac for panel, _ in found) else 5.4  # Names are longer.
+    figure, grid, columns = _grid(len(found), width, 1.3 + 0.32 * most, extra=0.7)
     for axes, (panel, rows) in zip(grid, found, strict=True):
         for end, style in ((0.0, DOTTED), (1.0, DASHED)):
             axes.axvline(end, color=BLACK, linestyle=style, linewidth=1.2, zorder=1)
@@ -52,9 +55,11 @@ def draw_bars(panels: Sequence[Panel], path: Path) -> bool:
     return True
 
 
-def _grid(parts: int, width: float, height: float, *, extra: float, **shared: Any) -> Any:
+def _grid(
+    parts: int, width: float, height: float, *, extra: float, most: int = 3, **shared: Any
+) -> Any:
     """A figure with axes for each part, and its number of columns."""
-    columns = 2 if parts == 4 and shared else min(parts, 3)
+    columns = 2 if parts == 4 and shared else min(parts, most)
     lines = -(-parts // columns)
     figure = new_figure(width * columns, height * lines + extra)
     grid = figure.subplots(lines, columns, squeeze=False, **shared).flatten()
@@ -65,8 +70,9 @@ def _grid(parts: int, width: float, height: float, *, extra: float, **shared: An
 
 def _bar(axes: Any, place: int, row: Row, mean: Estimate) -> None:
     colour = GREY if row.is_control else row.look.color
-    hatch = "///" if row.profile == "paper" else None
-    axes.barh(place, mean.value, color=colour, alpha=0.85, hatch=hatch, height=0.7)
+    hatch = "///" if row.profile == "paper" else ""
+    hatch += ".." if row.beside_sac and row.algorithm == "ppo" else ""
+    axes.barh(place, mean.value, color=colour, alpha=0.85, hatch=hatch or None, height=0.7)
     if mean.low is not None and mean.high is not None:
         axes.plot([mean.low, mean.high], [place, place], color="black", linewidth=1.4, marker="|")
     # Beside the axes, where no line crosses the number.
@@ -121,17 +127,70 @@ def row_curves(row: Row, bins: int = BINS) -> tuple[np.ndarray, np.ndarray] | No
     return ((np.arange(bins) + 1) * steps / bins)[kept], curves[:, kept]
 
 
-def draw_results(table: Table, path: Path) -> bool:
-    """Write the PNG of a task's learning curves, controls on the right; False if there is none."""
-    parts: dict[str, list[tuple[Row, str, Look]]] = {"methods": [], "controls": []}
-    for row in longest(line.row for line in table.lines):
-        part = parts["controls" if row.is_control else "methods"]
-        part.append((row, row.name.removeprefix("control: "), row.look))
-    return _draw_curves(table.panel, [part for part in parts.items() if part[1]], path)
+def draw_results(table: Table, path: Path) -> list[Path]:
+    """Write the PNG of a task's learning curves, controls on the right; empty if there is none.
+
+    Where runs have SAC, or more than 8 methods are drawn, a part has at most 8 lines and each
+    method of a part its own colour. More than 8 rows then take two pictures: the second, of
+    controls, is named ``-controls.png``.
+    """
+    rows = longest(line.row for line in table.lines)
+    kinds = {
+        "methods": [row for row in rows if not row.is_control],
+        "controls": [row for row in rows if row.is_control],
+    }
+    kinds = {name: each for name, each in kinds.items() if each}
+    if not table.panel.has_sac and len(kinds.get("methods", [])) <= MOST:
+        parts = [(name, [_labelled(row) for row in each]) for name, each in kinds.items()]
+        return [path] if _draw_curves(table.panel, parts, path) else []
+    split = {name: _parts(name, each) for name, each in kinds.items()}
+    if len(rows) <= MOST:
+        every = [part for parts in split.values() for part in parts]
+        return [path] if _draw_curves(table.panel, every, path, columns=2) else []
+    paths = {"methods": path, "controls": path.with_stem(f"{path.stem}-controls")}
+    return [
+        paths[name]
+        for name, each in split.items()
+        if _draw_curves(table.panel, each, paths[name], columns=2)
+    ]
 
 
-def draw_varied(table: Table, path: Path) -> bool:
-    """Write the PNG of an ablation's learning curves; False if there is none.
+def _labelled(row: Row) -> tuple[Row, str, Look]:
+    return row, row.name.removeprefix("control: "), row.look
+
+
+def _parts(kind: str, rows: Sequence[Row]) -> list[Part]:
+    """The rows in parts of at most 8 lines, about equally many, with those of a method together."""
+    count = -(-len(rows) // MOST)
+    most = -(-len(rows) // count)
+    parts: list[list[Row]] = [[]]
+    for method in dict.fromkeys(row.method for row in rows):
+        same = [row for row in rows if row.method == method]
+        if parts[-1] and len(parts[-1]) + len(same) > most:
+            parts.append([])
+        parts[-1] += same
+    titles = [f"{kind}, {i} of {len(parts)}" for i in range(1, len(parts) + 1)]
+    return [
+        (title if len(parts) > 1 else kind, _told_apart(part))
+        for title, part in zip(titles, parts, strict=True)
+    ]
+
+
+def _told_apart(rows: Sequence[Row]) -> list[tuple[Row, str, Look]]:
+    """The rows with their looks, but for methods whose colour one before them has already."""
+    colours: dict[str, str] = {}
+    for row in rows:
+        if row.look.color not in colours.values():
+            colours.setdefault(row.method, row.look.color)
+    for row in rows:
+        free = [color for color in PALETTE if color not in colours.values()]
+        colours.setdefault(row.method, next(iter(free), row.look.color))
+    labelled = [_labelled(row) for row in rows]
+    return [(row, name, look._replace(color=colours[row.method])) for row, name, look in labelled]
+
+
+def draw_varied(table: Table, path: Path) -> list[Path]:
+    """Write the PNG of an ablation's learning curves; empty if there is none.
 
     It has a part for each method and a line for each value, with the same colour in all parts.
     """
@@ -144,10 +203,13 @@ def draw_varied(table: Table, path: Path) -> bool:
         color = PALETTE[len(looks) % len(PALETTE)]
         style = looks.setdefault(label, Look(color, "-" if len(looks) < len(PALETTE) else "--"))
         parts.setdefault(line.row.name, []).append((line.row, label, style))
-    return _draw_curves(table.panel, list(parts.items()), path, about=f": {table.title}")
+    about = f": {table.title}"
+    return [path] if _draw_curves(table.panel, list(parts.items()), path, about) else []
 
 
-def _draw_curves(panel: Panel, parts: Sequence[Part], path: Path, about: str = "") -> bool:
+def _draw_curves(
+    panel: Panel, parts: Sequence[Part], path: Path, about: str = "", columns: int = 3
+) -> bool:
     rows = [row for _, lines in parts for row, _, _ in lines]
     curves = {id(row): row_curves(row) for row in rows}
     if not any(curves.values()):
@@ -156,7 +218,9 @@ def _draw_curves(panel: Panel, parts: Sequence[Part], path: Path, about: str = "
     ncols = 1 if max(len(label) for part in labels for label in part) > 36 else 2
     entries = max(sum(len(wrap(label, LEGEND)) for label in part) for part in labels) + 2
     height = 4.6 + 0.2 * -(-entries // ncols)
-    figure, grid, columns = _grid(len(parts), 6.2, height, extra=0.4, sharex=True, sharey=True)
+    figure, grid, columns = _grid(
+        len(parts), 6.2, height, extra=0.4, most=columns, sharex=True, sharey=True
+    )
     for axes, (title, lines) in zip(grid, parts, strict=True):
         for row, label, style in lines:
             _line(axes, row, curves[id(row)], label, style)

@@ -53,6 +53,13 @@ class RunRecord:
         return self.recipe
 
     @property
+    def algorithm(self) -> str | None:
+        """What trained the policy, "ppo" or "sac"; None without reinforcement learning."""
+        if "algorithm" in self.result:
+            return self.result["algorithm"]
+        return str(self.config.get("algorithm", "ppo")) if self.result["env_steps"] else None
+
+    @property
     def task(self) -> str:
         """The task's name."""
         return str(self.config["task.name"])
@@ -66,6 +73,14 @@ class RunRecord:
     def score(self) -> float:
         """Mean return of the policy as trained."""
         return float(self.result["return_mean"])
+
+    @property
+    def mode(self) -> float | None:
+        """Mean return with the policy's most likely actions: SAC's score; None if not measured."""
+        if self.result.get("sampled") is not None:
+            return self.score
+        mode = self.result.get("deterministic")
+        return float(mode["return_mean"]) if mode else None
 
     @property
     def seed(self) -> int:
@@ -127,7 +142,7 @@ def read_runs(folder: Path) -> tuple[list[RunRecord], list[Unfinished]]:
             finished.append(RunRecord(run, name, config, read_result(run), folder))
         else:
             check_run_format(run)
-            rows = [row for row in read_metrics(run / METRICS) if row["phase"] == "ppo"]
+            rows = [row for row in read_metrics(run / METRICS) if row["phase"] in ("ppo", "sac")]
             taken = max((row["step"] for row in rows), default=0)
             state, reason = known.pop(name, ("unfinished", ""))
             others[name] = Unfinished(name, state, f"{taken:,} of {config['steps']:,}", reason)

@@ -9,6 +9,7 @@ from typing import Any
 from giril_rl.experiments.report.captions import caption, made_with
 from giril_rl.experiments.report.charts import draw_bars, draw_results, draw_varied
 from giril_rl.experiments.report.entries import PLAYER, TRUE_REWARD
+from giril_rl.experiments.report.learners import learner_and_reward
 from giril_rl.experiments.report.pictures import draw_pictures
 from giril_rl.experiments.report.reading import RunRecord, Unfinished, read_runs
 from giril_rl.experiments.report.rows import Panel
@@ -24,6 +25,8 @@ _RUN_COLUMNS = (
     *("wall_seconds", "steps_per_second", "config_hash", "last_line"),
     *("demo", "demo_id", "expert_return_mean", "demo_return_mean", "normalised"),
 )
+_BESIDE_SAC = ("algorithm", "score_over_demo")
+"""Columns of reports in which a run has SAC."""
 
 
 def write_report(folder: Path, out: Path) -> str:
@@ -43,7 +46,10 @@ def write_report(folder: Path, out: Path) -> str:
     if draw_bars(panels, out / "normalised.png"):
         sections.append("## All tasks\n\n![normalised scores](normalised.png)\n")
         sections.append(overall(panels))
-    sections += [_section(table, out) for table in tables]
+    for table in tables:
+        sections.append(_section(table, out))
+        if table.name == "results":
+            sections.append(learner_and_reward(table.panel))
     sections += draw_pictures(panels, out)
     sections += [_repeats(panels), _without_result(unfinished)]
     write_atomically(out / "report.md", "\n".join(text for text in sections if text))
@@ -60,12 +66,14 @@ def _head(runs: Sequence[RunRecord], unfinished: Sequence[Unfinished]) -> str:
         if unfinished
         else ""
     )
+    has_sac = any(run.algorithm == "sac" for run in runs)
+    sac = "; one that SAC trained takes its mean action" if has_sac else ""
     return (
         "# Results\n\n"
         f"{len(runs)} finished runs, made with {made_with(runs)}.{missing}\n\n"
         f"- **score**: the task's own return, the mean over {' or '.join(map(str, episodes))} "
-        "whole episodes on fresh environments. The policy samples its actions, as in training. "
-        "`n` is the number of seeds, `steps` what the policy trained for.\n"
+        "whole episodes on fresh environments. The policy samples its actions, as in training"
+        f"{sac}. `n` is the number of seeds, `steps` what the policy trained for.\n"
         "- **normalised**: (score - random) / (player - random). 0 is the mean score of a random "
         "policy on that task, 1 that of the player whose demonstration the run learned from. A run "
         "without a demonstration has the player of its seed.\n"
@@ -88,8 +96,8 @@ def _section(table: Table, out: Path) -> str:
     name = f"curves-{safe(title.replace(', ', '-'))}"
     name += "" if table.name == "results" else f"-{table.name}"
     draw = draw_results if table.name == "results" else draw_varied
-    if draw(table, out / f"{name}.png"):
-        text.append(f"![{table.title}, {title}]({name}.png)\n")
+    for path in draw(table, out / f"{name}.png"):
+        text.append(f"![{table.title}, {title}]({path.name})\n")
     return "\n".join(text)
 
 
@@ -120,11 +128,14 @@ def _runs_csv(unfinished: Sequence[Unfinished], panels: Sequence[Panel]) -> str:
                 "state": "finished",
                 "method": PLAYER if run.method == TRUE_REWARD else run.method,
                 "reward_seed": run.result.get("seeds", {}).get("reward"),
-                "mode_return_mean": (run.result.get("deterministic") or {}).get("return_mean"),
+                "mode_return_mean": run.mode,
                 "normalised": panel.normalised_run(run),
+                "algorithm": run.algorithm,
+                "score_over_demo": panel.over_demonstration_run(run),
             }
     ordered = [rows[name] for name in sorted(rows, key=Path)]
     ordered += [
         {"folder": run.name, "state": run.state, "last_line": run.reason} for run in unfinished
     ]
-    return csv_text(_RUN_COLUMNS, ([row.get(key) for key in _RUN_COLUMNS] for row in ordered))
+    columns = _RUN_COLUMNS + _BESIDE_SAC * any(panel.has_sac for panel in panels)
+    return csv_text(columns, ([row.get(key) for key in columns] for row in ordered))

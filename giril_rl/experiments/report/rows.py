@@ -26,13 +26,18 @@ from giril_rl.experiments.report.settings import (
 from giril_rl.experiments.report.statistics import Estimate, mean_and_iqm
 from giril_rl.rewards.method import Method
 from giril_rl.training.baselines import RANDOM
+from giril_rl.training.result import score_over_demonstration
+
+STYLES = ("-", "--", "-.", ":")
+DOTS = ((0, (1, 1)), (0, (5, 1.5, 1, 1.5)), (0, (1, 2.5)), (0, (5, 1.5, 1, 1.5, 1, 1.5)))
+"""The line styles of PPO's rows beside those of SAC, in the order of ``STYLES``."""
 
 
 class Look(NamedTuple):
     """How a line is drawn."""
 
     color: str
-    linestyle: str
+    linestyle: Any
 
 
 @dataclass(eq=False)
@@ -46,6 +51,8 @@ class Row:
         steps: the budget of environment steps.
         runs: its runs, by seed.
         number: the place of your own recipe among all of them in the report.
+        algorithm: "ppo" or "sac"; None without reinforcement learning.
+        beside_sac: whether a run of its panel has SAC, so that names tell the algorithm.
     """
 
     method: str
@@ -54,6 +61,8 @@ class Row:
     steps: int
     runs: list[RunRecord] = field(default_factory=list)
     number: int = 0
+    algorithm: str | None = None
+    beside_sac: bool = False
 
     @property
     def about(self) -> Method:
@@ -67,9 +76,32 @@ class Row:
         Examples:
             >>> Row("giril", "paper", (), 10).name, Row("control:copy", "released", (), 10).name
             ('GIRIL (paper)', 'control: copy')
+            >>> Row("giril", "paper", (), 10, algorithm="ppo", beside_sac=True).name
+            'GIRIL (paper, PPO)'
+            >>> Row("expert:whole_budget", None, (), 10, algorithm="sac", beside_sac=True).name
+            'SAC on the true reward'
         """
+        algorithm = (self.algorithm or "").upper() if self.beside_sac else ""
+        if self.method == TRUE_REWARD and algorithm:
+            return f"{algorithm} on the true reward"
+        return _in_brackets(self.about.label, self._shown_profile, algorithm)
+
+    @property
+    def name_of_both(self) -> str:
+        """The method as a table names it that has a column for each algorithm.
+
+        Examples:
+            >>> Row("giril", "paper", (), 10, algorithm="ppo", beside_sac=True).name_of_both
+            'GIRIL (paper)'
+        """
+        if self.method == TRUE_REWARD:
+            return "the true reward"
+        return _in_brackets(self.about.label, self._shown_profile)
+
+    @property
+    def _shown_profile(self) -> str:
         shown = self.profile and not (self.is_control and self.profile == "released")
-        return f"{self.about.label} ({self.profile})" if shown else self.about.label
+        return str(self.profile) if shown else ""
 
     @property
     def is_control(self) -> bool:
@@ -83,9 +115,18 @@ class Row:
 
     @property
     def look(self) -> Look:
-        """How it is drawn: the profile "paper" and the seventh recipe of your own are dashed."""
+        """How it is drawn: the profile "paper" and the seventh recipe of your own are dashed.
+
+        PPO's rows are dotted where others have SAC.
+        """
         turn = 2 * (self.number // len(OWN)) + (self.profile == "paper")
-        return Look(self.about.colour, ("-", "--", "-.", ":")[turn % 4])
+        styles = DOTS if self.beside_sac and self.algorithm == "ppo" else STYLES
+        return Look(self.about.colour, styles[turn % 4])
+
+    @property
+    def kind(self) -> tuple[str, str | None, str | None]:
+        """What its runs share whatever their budget and settings."""
+        return self.method, self.profile, self.algorithm
 
     @property
     def settings(self) -> str:
@@ -105,8 +146,9 @@ class Row:
     @property
     def modes(self) -> list[float]:
         """Each run's mean return with the policy's most likely actions; empty if a run has none."""
-        found = [run.result.get("deterministic") for run in self.runs]
-        return [float(mode["return_mean"]) for mode in found if mode] if all(found) else []
+        found = [run.mode for run in self.runs]
+        scores = [score for score in found if score is not None]
+        return scores if len(scores) == len(found) else []
 
     @property
     def trained_steps(self) -> list[int]:
@@ -131,7 +173,13 @@ class Row:
     def order(self) -> tuple[Any, ...]:
         """Sorts the rows of a table."""
         changes = [(key, _numeric(value)) for key, value in self.changes]
-        return (*order(self.method), self.profile != "released", self.steps, changes)
+        profile = self.profile != "released"
+        return (*order(self.method), profile, self.steps, self.algorithm or "", changes)
+
+
+def _in_brackets(label: str, *words: str) -> str:
+    shown = ", ".join(filter(None, words))
+    return f"{label} ({shown})" if shown else label
 
 
 def mean(values: Sequence[float | None]) -> float | None:
@@ -195,6 +243,11 @@ class Panel:
         return [run for row in self.rows for run in row.runs]
 
     @property
+    def has_sac(self) -> bool:
+        """Whether a policy of it was trained by SAC."""
+        return any(row.beside_sac for row in self.rows)
+
+    @property
     def demonstration(self) -> str:
         """What to call the demonstration: the score of one life is not that of a whole game."""
         lives = {run.config["demo.lives"] for run in self.runs if "demo.lives" in run.config}
@@ -219,15 +272,19 @@ class Panel:
         return mean([score for row in self.rows if row.method == RANDOM for score in row.scores])
 
     @cached_property
-    def _players(self) -> dict[int, float]:
-        key = "expert_return_mean"
-        return by_seed(self.runs, key) | self._main_by_seed(key)
+    def _of_seeds(self) -> dict[str, dict[int, float]]:
+        keys = ("expert_return_mean", "demo_return_mean")
+        return {key: by_seed(self.runs, key) | self._main_by_seed(key) for key in keys}
+
+    def _reference(self, run: RunRecord, key: str) -> float | None:
+        """A run's own ``key``; that of its seed if the run has no demonstration."""
+        if run.result.get(key) is not None:
+            return float(run.result[key])
+        return None if run.has_demonstration else self._of_seeds[key].get(run.seed)
 
     def player(self, run: RunRecord) -> float | None:
         """Score of a run's player; that of its seed if the run has no demonstration."""
-        if run.result.get("expert_return_mean") is not None:
-            return float(run.result["expert_return_mean"])
-        return None if run.has_demonstration else self._players.get(run.seed)
+        return self._reference(run, "expert_return_mean")
 
     def normalised_run(self, run: RunRecord) -> float | None:
         """A run's normalised score.
@@ -246,18 +303,40 @@ class Panel:
         scores = [score for score in found if score is not None]
         return scores if len(scores) == len(found) else []
 
+    def over_demonstration_run(self, run: RunRecord) -> float | None:
+        """A run's score divided by its demonstration's return, or by that of its seed.
+
+        None for the player itself, and where the quotient would mislead, see
+        :func:`giril_rl.training.result.score_over_demonstration`.
+        """
+        if run.method == PLAYER:
+            return None
+        return score_over_demonstration(run.score, self._reference(run, "demo_return_mean"))
+
+    def over_demonstration(self, row: Row) -> list[float]:
+        """The same of a row's runs; empty if one of them has none."""
+        found = [self.over_demonstration_run(run) for run in row.runs]
+        ratios = [ratio for ratio in found if ratio is not None]
+        return ratios if len(ratios) == len(found) else []
+
     def best_control(self, row: Row) -> Row | None:
         """The control with the highest mean at a row's budget, with its recipe's own settings.
 
         A row that took no environment steps is compared at the controls' largest budget. None if no
-        control was trained at that budget: a random policy alone is no comparison.
+        control was trained at that budget: a random policy alone is no comparison. With which
+        algorithm it was trained does not matter.
         """
+        most = max((other.steps for other in self.main if other.is_control), default=0)
+        return self.best_control_at(row.steps if row.is_trained else most)
+
+    def best_control_at(self, steps: int, algorithm: str | None = None) -> Row | None:
+        """The best control at a budget, trained by ``algorithm`` if one is given."""
         controls = [other for other in self.main if other.is_control]
-        most = max((other.steps for other in controls), default=0)
-        steps = row.steps if row.is_trained else most
         fair = [other for other in controls if other.steps == steps and other.is_trained]
+        fair = [other for other in fair if algorithm in (None, other.algorithm)]
         fair += [other for other in controls if fair and not other.is_trained]
-        fair.sort(key=lambda other: (not other.is_trained, other.method))  # Decides ties.
+        # Decides ties.
+        fair.sort(key=lambda other: (not other.is_trained, other.method, other.algorithm or ""))
         return max(fair, key=lambda other: other.estimates[0].value, default=None)
 
 
@@ -298,11 +377,13 @@ def _panel(
     shared = shared_changes(runs, others, keep)
     rows: dict[tuple[Any, ...], Row] = {}
     repeats = []
+    has_sac = any(run.algorithm == "sac" for run in runs)
     for run in runs:
         differing = tuple(change for change in others[run.name] if change not in shared)
         number = own.index(run.method) if run.method in own else 0
         key = (run.method, profile_of(run), differing, run.steps)
-        row = rows.setdefault(key, Row(*key, number=number))
+        row = Row(*key, number=number, algorithm=run.algorithm, beside_sac=has_sac)
+        row = rows.setdefault((*key, run.algorithm), row)
         if run.seed in row.seeds:
             repeats.append(run)
         else:

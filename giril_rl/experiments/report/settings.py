@@ -22,7 +22,7 @@ from giril_rl.runs.identity import ADDED, NO_EFFECT
 
 # Other fields of a row or a panel hold these.
 _IDENTITY = NO_EFFECT | {"recipe", "seed", "steps", "task.name", "task.steps"}
-_IDENTITY |= {"profile", "batch_mean"}
+_IDENTITY |= {"profile", "batch_mean", "algorithm"}
 Changes = tuple[tuple[str, str], ...]
 """``(key, value as text)`` of the settings that differ from the recipe's own, by key."""
 
@@ -120,7 +120,8 @@ def _reads(run: RunRecord, key: str) -> bool:
         return run.method != TRUE_REWARD
     if key == "reward":
         return run.recipe != "control"
-    return not key.startswith(_ignored(entry(run.method)))
+    idle = "ppo." if run.config.get("algorithm") == "sac" else "sac."
+    return not key.startswith((idle, *_ignored(entry(run.method))))
 
 
 @cache
@@ -134,9 +135,9 @@ def _ignored(about: Method) -> tuple[str, ...]:
     if about.trained != "before":
         found.append("fit.")
     if not about.demonstration:
-        found += ["demo.", "expert."]
+        found += ["demo.", "expert.", "sac.demonstration"]
     if about.build is None:  # It has no reward, and so no policy to train.
-        found += ["ppo.", "scaling.", "batch_mean"]
+        found += ["ppo.", "sac.", "scaling.", "batch_mean"]
     return tuple(found)
 
 

@@ -142,6 +142,12 @@ class Line:
         return mean_and_iqm(scores) if scores else None
 
     @cached_property
+    def over_demonstration(self) -> Estimate | None:
+        """Mean of the row's scores divided by the demonstrations' returns, in panels with SAC."""
+        ratios = self.panel.over_demonstration(self.row) if self.panel.has_sac else []
+        return mean_and_iqm(ratios)[0] if ratios else None
+
+    @cached_property
     def improvement(self) -> tuple[Estimate, Row] | None:
         """Probability of improvement over the best control at the same budget, and that control."""
         best = self.panel.best_control(self.row)
@@ -216,12 +222,13 @@ def tables_of(panel: Panel) -> list[Table]:
 
 def _beside_their_own(panel: Panel, varied: Sequence[Row]) -> list[Row]:
     """The rows, and those of the same methods and budgets with the recipe's own settings."""
-    kinds = {(row.method, row.profile, row.steps) for row in varied}
-    own = [row for row in panel.main if (row.method, row.profile, row.steps) in kinds]
+    kinds = {(row.kind, row.steps) for row in varied}
+    own = [row for row in panel.main if (row.kind, row.steps) in kinds]
     return sorted([*own, *varied], key=lambda row: row.order)
 
 
 def _line(panel: Panel, row: Row, about: str, words: str = "", value: str | None = None) -> Line:
-    # The paper's figures are of the unchanged task.
-    figure = None if panel.changes else paper_figure(about, panel.task, row.method, value)
+    # The paper's figures are of PPO on the unchanged task.
+    other = panel.changes or row.algorithm == "sac"
+    figure = None if other else paper_figure(about, panel.task, row.method, value)
     return Line(panel, row, words, figure)

@@ -103,6 +103,9 @@ def table_markdown(table: Table) -> str:
                 "steps": steps_text(row),
                 "score [95%]": bold.format(with_interval(row.estimates[0])),
                 "normalised [95%]": with_interval(line.normalised[0], 2) if line.normalised else "",
+                "over demonstration [95%]": (
+                    with_interval(line.over_demonstration, 2) if line.over_demonstration else ""
+                ),
                 "P(> best control) [95%]": (
                     with_interval(line.improvement[0], 2) if line.improvement else ""
                 ),
@@ -114,8 +117,14 @@ def table_markdown(table: Table) -> str:
 
 
 def results_csv(tables: Sequence[Table]) -> str:
-    """All lines of all tables as CSV, with unrounded numbers."""
+    """All lines of all tables as CSV, with unrounded numbers.
+
+    What only SAC makes necessary has columns only where a run has it.
+    """
     rows = [_record(table, line) for table in tables for line in table.lines]
+    if any(table.panel.has_sac for table in tables):
+        lines = [line for table in tables for line in table.lines]
+        rows = [row | _beside_sac(line) for row, line in zip(rows, lines, strict=True)]
     return csv_text(rows[0], (row.values() for row in rows))
 
 
@@ -153,6 +162,18 @@ def _record(table: Table, line: Line) -> dict[str, Any]:
     }
 
 
+def _beside_sac(line: Line) -> dict[str, Any]:
+    none = Estimate(*[None] * 3)  # type: ignore[arg-type]
+    over = line.over_demonstration or none
+    return {
+        "algorithm": line.row.algorithm,
+        **_columns("over_demonstration", "over_demonstration", over),
+        "each_seed_over_demonstration": _words(
+            line.panel.over_demonstration(line.row) if line.over_demonstration else []
+        ),
+    }
+
+
 def _words(values: Iterable[Any]) -> str:
     return " ".join(map(str, values))
 
@@ -162,15 +183,15 @@ def _columns(name: str, bounds: str, estimate: Estimate) -> dict[str, float | No
 
 
 def longest(rows: Iterable[Row]) -> list[Row]:
-    """The row with the largest budget for each method except the expert.
+    """The row with the largest budget for each method and algorithm, except the expert.
 
     Examples:
         >>> [row.steps for row in longest([Row("bc", None, (), 10), Row("bc", None, (), 20)])]
         [20]
     """
-    found: dict[tuple[str, str | None], Row] = {}
+    found: dict[tuple[str, str | None, str | None], Row] = {}
     for row in rows:
-        key = row.method, row.profile
+        key = row.kind
         if row.method != PLAYER and (key not in found or row.steps > found[key].steps):
             found[key] = row
     return list(found.values())
@@ -193,14 +214,15 @@ def overall(panels: Sequence[Panel]) -> str:
     It has the methods that were run on every task, with the seeds that they have on each of them.
     """
     found = comparable(panels)
-    kinds: dict[tuple[str, str | None], list[dict[int, float]]] = {}
-    shown: dict[tuple[str, str | None], Row] = {}
+    kinds: dict[tuple[str, str | None, str | None], list[dict[int, float]]] = {}
+    shown: dict[tuple[str, str | None, str | None], Row] = {}
     for panel, rows in found:
         for row in rows:
-            kind = row.method, row.profile
+            kind = row.kind
             scores = dict(zip(row.seeds, panel.normalised(row), strict=True))
             kinds.setdefault(kind, []).append(scores)
-            shown[kind] = row
+            if row.beside_sac or kind not in shown:
+                shown[kind] = row
     lines, missing = [], []
     for kind, tasks in kinds.items():
         seeds = sorted(set.intersection(*map(set, tasks)))

@@ -33,7 +33,11 @@ def made(tmp_path):
         method = f"control:{config.reward}" if recipe == "control" else recipe
         trained = 0 if method in ("bc", "control:random") else config.steps
         rows = [
-            {"phase": "ppo", "step": trained * i // 4, "train/return_mean": i * (score or 1.0) / 4}
+            {
+                "phase": config.algorithm,
+                "step": trained * i // 4,
+                "train/return_mean": i * (score or 1.0) / 4,
+            }
             for i in range(1, 5)
             if trained
         ]
@@ -41,6 +45,7 @@ def made(tmp_path):
         if score is None:
             return folder
         lengths = {"return_std": 1.0, "return_median": score, "episode_length_mean": 100.0}
+        other = "sampled" if config.algorithm == "sac" else "deterministic"
         has_demo = recipe not in ("expert", "control")
         values = {
             "method": method,
@@ -52,7 +57,8 @@ def made(tmp_path):
             "return_mean": score,
             **lengths,
             "episodes": 20,
-            "deterministic": {**lengths, "return_mean": score if mode is None else mode},
+            "algorithm": config.algorithm if trained else None,
+            other: {**lengths, "return_mean": score if mode is None else mode},
             "demo_transitions": 1000 if has_demo else None,
             "expert_return_mean": 900.0 if has_demo else None,
             "demo_return_mean": 1000.0 if has_demo else None,
