@@ -64,7 +64,7 @@ class DREXConfig:
     normalise: str = knob(
         "standardise",
         "observation rule, of the played episodes",
-        choices=("demo_range", "standardise", "raw"),
+        choices=("demo_range", "standardise", "raw", "pixels"),
     )
     clamp: float = knob(10.0, "bound on each scaled observation", low=0, low_open=True)
     use_actions: bool = knob(False, USE_ACTIONS)
@@ -73,8 +73,14 @@ class DREXConfig:
     )
 
     def check(self, prefix: str, run: Any) -> None:
-        """Refuses frames, before anything is trained."""
+        """Refuses frames and a margin that no pair has, before anything is trained."""
         refuse_frames(run.task.family.observation)
+        widest = 1 - 1 / run.ranking.levels
+        if self.margin > widest + 1e-6:
+            raise UserError(
+                f"{prefix}margin={self.margin} is more than any two of the noise levels differ: "
+                f"set at most {widest:.2f}, or more ranking.levels."
+            )
 
 
 class DREXReward(Pretrained, TransitionReward):

@@ -69,10 +69,8 @@ def test_levels_that_differ_by_the_margin_count_whatever_the_rounding():
     noise = (torch.arange(20) / 20).tolist()
     better, worse = drawn(noise, [1] * 20, snippet=1, pairs=20_000)
     gaps = (worse - better).flatten()
-    assert gaps.min() == 6 and len(torch.stack([better, worse], -1).unique(dim=0)) <= 105
-    assert (
-        torch.stack([better[:, 0], worse[:, 0]], -1).unique(dim=0).shape[0] == 105
-    )  # 14 + ... + 1
+    assert gaps.min() == 6  # 0.3 and more.
+    assert len(torch.cat([better, worse], 1).unique(dim=0)) == 14 * 15 / 2
 
 
 def test_snippets_are_consecutive_steps_of_one_episode_from_anywhere():
