@@ -9,19 +9,18 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import torch
 from torchrl.envs import Compose
 
 from giril_rl.config.schema import FitConfig, OffPolicyRunConfig
 from giril_rl.demos import holdout, subsample
 from giril_rl.envs import make_env
-from giril_rl.rewards.disagreement import BOOTSTRAP, bootstrapped
+from giril_rl.rewards.disagreement import bootstrapped
 from giril_rl.rewards.dril import DisagreementConfig, DisagreementLoss, dril_reward
 from giril_rl.training import (
-    CloningTrainer,
     finish_run,
     fit_reward,
     make_algorithm,
+    make_cloning,
     obtain_demonstration,
     open_run,
     return_scaling,
@@ -52,26 +51,14 @@ def main(cfg: Config, out: Path) -> None:
         reward = dril_reward(settings, env, pairs, seed=seed).to(cfg.device)
         samples = bootstrapped(pairs, settings.members, seed=seed)
         # Every member is held to all of what no member has seen.
-        validation[BOOTSTRAP] = torch.ones(len(validation), settings.members)
+        validation = bootstrapped(validation, settings.members, seed=None)
         loss = DisagreementLoss(reward, bootstrap=True)
         fit_reward(loss, samples, cfg.fit, seed=seed, run=run, validation=validation)
         reward.calibrate(pairs, settings.quantile)
 
-        transform = Compose(
-            IntrinsicReward(reward),
-            *return_scaling(cfg),
-        )
+        transform = Compose(IntrinsicReward(reward), *return_scaling(cfg))
         learner = make_algorithm(env, cfg, run=run, demo=demo, transform=transform)
-        cloning = None
-        if settings.bc_every is not None:
-            cloning = CloningTrainer(
-                learner.agent,
-                pairs,
-                every=settings.bc_every,
-                batch=settings.bc_batch,
-                lr=settings.bc_lr,
-                seed=cfg.seed,
-            )
+        cloning = make_cloning(learner.agent, pairs, settings, seed=cfg.seed)
         trained = train_policy(
             env, learner, transform, seed=cfg.seed, run=run, reward_trainer=cloning
         )

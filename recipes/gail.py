@@ -44,24 +44,16 @@ def main(cfg: Config, out: Path) -> None:
         pairs = subsample(demo, cfg.demo.subsample)
         env = run.closing(make_env(cfg.task, cfg.learner.num_envs, cfg.seed))
 
-        seed = cfg.reward_seed
-        settings = cfg.reward.settled(cfg)
+        seed, settings = cfg.reward_seed, cfg.reward.settled(cfg)
         reward = discriminator_reward(settings, env, pairs, seed=seed).to(cfg.device)
-        loss = DiscriminatorLoss(reward, penalty=cfg.reward.penalty)
+        loss = DiscriminatorLoss(reward, penalty=settings.penalty)
 
-        transform = Compose(
-            IntrinsicReward(reward),
-            *absorbing_value(reward, cfg.learner.gamma),
-            *return_scaling(cfg),
-        )
+        absorbing = absorbing_value(reward, cfg.learner.gamma)
+        transform = Compose(IntrinsicReward(reward), *absorbing, *return_scaling(cfg))
         learner = make_algorithm(env, cfg, run=run, demo=demo, transform=transform, moving=True)
+        ends = terminal_rate(demo.transitions)
         trainer = AdversarialTrainer(
-            loss,
-            pairs,
-            settings,
-            seed=seed,
-            source=learner.own,
-            terminal_rate=terminal_rate(demo.transitions),
+            loss, pairs, settings, seed=seed, source=learner.own, terminal_rate=ends
         )
         trained = train_policy(
             env, learner, transform, seed=cfg.seed, run=run, reward_trainer=trainer

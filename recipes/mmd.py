@@ -45,10 +45,7 @@ def main(cfg: Config, out: Path) -> None:
         reward = mmd_reward(cfg.reward, env, pairs, seed=cfg.reward_seed).to(cfg.device)
         visits = VisitTrainer(reward, seed=cfg.reward_seed)
 
-        transform = Compose(
-            IntrinsicReward(reward),
-            *return_scaling(cfg),
-        )
+        transform = Compose(IntrinsicReward(reward), *return_scaling(cfg))
         learner = make_algorithm(env, cfg, run=run, demo=demo, transform=transform, moving=True)
         trained = train_policy(
             env, learner, transform, seed=cfg.seed, run=run, reward_trainer=visits

@@ -45,10 +45,7 @@ def main(cfg: Config, out: Path) -> None:
 
         reward = pwil_reward(cfg.reward, env, pairs, seed=cfg.reward_seed).to(cfg.device)
 
-        transform = Compose(
-            IntrinsicReward(reward),
-            *return_scaling(cfg),
-        )
+        transform = Compose(IntrinsicReward(reward), *return_scaling(cfg))
         learner = make_algorithm(env, cfg, run=run, demo=demo, transform=transform)
         trained = train_policy(env, learner, transform, seed=cfg.seed, run=run)
         finish_run(run, cfg, learner.agent, trained, expert=expert, demo=demo, reward=reward)

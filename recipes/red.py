@@ -50,10 +50,7 @@ def main(cfg: Config, out: Path) -> None:
         if cfg.reward.sigma is None:
             reward.calibrate(pairs, cfg.reward.demo_reward)
 
-        transform = Compose(
-            IntrinsicReward(reward),
-            *return_scaling(cfg),
-        )
+        transform = Compose(IntrinsicReward(reward), *return_scaling(cfg))
         learner = make_algorithm(env, cfg, run=run, demo=demo, transform=transform)
         trained = train_policy(env, learner, transform, seed=cfg.seed, run=run)
         finish_run(run, cfg, learner.agent, trained, expert=expert, demo=demo, reward=reward)

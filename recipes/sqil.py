@@ -11,7 +11,6 @@ from pathlib import Path
 from giril_rl.config.schema import OffPolicyRunConfig, SACConfig, ScalingConfig
 from giril_rl.demos import subsample
 from giril_rl.envs import make_env
-from giril_rl.errors import UserError
 from giril_rl.rewards.sqil import SQILConfig, sqil_reward
 from giril_rl.training import (
     finish_run,
@@ -31,29 +30,6 @@ class Config(OffPolicyRunConfig):
     scaling: ScalingConfig = field(default_factory=lambda: ScalingConfig(enabled=False))
     reward: SQILConfig = field(default_factory=SQILConfig)
 
-    def check(self, prefix: str, run: object) -> None:
-        """Refuses a learner without a replay, and a replay without the demonstration."""
-        if self.task.family.observation == "image":
-            raise UserError(
-                f"SQIL learns of vectors and {self.task.name} shows images, for which SAC has no "
-                "networks: choose another recipe."
-            )
-        if self.algorithm != "sac":
-            raise UserError(
-                f"algorithm={self.algorithm}: SQIL pays for transitions in a replay buffer, which "
-                "PPO has not; leave algorithm=sac."
-            )
-        if self.sac.demonstration == "none":
-            raise UserError(
-                "sac.demonstration=none: all rewards of SQIL but the demonstration's are equal; "
-                "leave sac.demonstration=half."
-            )
-        if self.scaling.enabled:
-            raise UserError(
-                "scaling.enabled=true: SQIL's own rewards are constant and have no scale; leave "
-                "scaling.enabled=false."
-            )
-
 
 def main(cfg: Config, out: Path) -> None:
     """Train the whole chain and leave its run folder in ``out``."""
@@ -66,13 +42,9 @@ def main(cfg: Config, out: Path) -> None:
 
         reward = sqil_reward(cfg.reward, env, pairs, seed=cfg.reward_seed)
         transform = IntrinsicReward(reward)
+        paid = cfg.reward.demonstration
         learner = make_algorithm(
-            env,
-            cfg,
-            run=run,
-            demo=demo,
-            transform=transform,
-            demonstration_reward=cfg.reward.demonstration,
+            env, cfg, run=run, demo=demo, transform=transform, demonstration_reward=paid
         )
         trained = train_policy(env, learner, transform, seed=cfg.seed, run=run)
         finish_run(run, cfg, learner.agent, trained, expert=expert, demo=demo, reward=reward)

@@ -13,7 +13,7 @@ from torchrl.envs import Compose
 from giril_rl.config.schema import RewardRunConfig
 from giril_rl.demos import subsample
 from giril_rl.envs import make_env
-from giril_rl.rewards import BottleneckConfig, BottleneckLoss, bottleneck_reward
+from giril_rl.rewards import BottleneckConfig, bottleneck_loss, bottleneck_reward
 from giril_rl.training import (
     AdversarialTrainer,
     absorbing_value,
@@ -44,30 +44,16 @@ def main(cfg: Config, out: Path) -> None:
         pairs = subsample(demo, cfg.demo.subsample)
         env = run.closing(make_env(cfg.task, cfg.learner.num_envs, cfg.seed))
 
-        seed = cfg.reward_seed
-        settings = cfg.reward.settled(cfg)
+        seed, settings = cfg.reward_seed, cfg.reward.settled(cfg)
         reward = bottleneck_reward(settings, env, pairs, seed=seed).to(cfg.device)
-        loss = BottleneckLoss(
-            reward,
-            information=cfg.reward.information,
-            beta_step=cfg.reward.beta_step,
-            beta=cfg.reward.beta_start,
-            penalty=cfg.reward.penalty,
-        )
+        loss = bottleneck_loss(reward, settings)
 
-        transform = Compose(
-            IntrinsicReward(reward),
-            *absorbing_value(reward, cfg.learner.gamma),
-            *return_scaling(cfg),
-        )
+        absorbing = absorbing_value(reward, cfg.learner.gamma)
+        transform = Compose(IntrinsicReward(reward), *absorbing, *return_scaling(cfg))
         learner = make_algorithm(env, cfg, run=run, demo=demo, transform=transform, moving=True)
+        ends = terminal_rate(demo.transitions)
         trainer = AdversarialTrainer(
-            loss,
-            pairs,
-            settings,
-            seed=seed,
-            source=learner.own,
-            terminal_rate=terminal_rate(demo.transitions),
+            loss, pairs, settings, seed=seed, source=learner.own, terminal_rate=ends
         )
         trained = train_policy(
             env, learner, transform, seed=cfg.seed, run=run, reward_trainer=trainer

@@ -56,7 +56,11 @@ class EnsembleMLP(nn.Module):
 
     def forward(self, inputs: Tensor) -> Tensor:
         """``(*batch, in_features)`` to ``(members, *batch, out_features)``."""
-        x = inputs.reshape(1, -1, inputs.shape[-1]).expand(self.members, -1, -1)
-        for i, layer in enumerate(self.layers):
-            x = layer(x.relu() if i else x)
+        x = self.separately(inputs.reshape(1, -1, inputs.shape[-1]).expand(self.members, -1, -1))
         return x.reshape(self.members, *inputs.shape[:-1], x.shape[-1])
+
+    def separately(self, inputs: Tensor) -> Tensor:
+        """Each member its own input, ``(members, n, in_features)`` to ``(members, n, k)``."""
+        for i, layer in enumerate(self.layers):
+            inputs = layer(inputs.relu() if i else inputs)
+        return inputs

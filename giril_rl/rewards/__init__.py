@@ -2,6 +2,8 @@
 
 from giril_rl.rewards.actions import ActionEncoder
 from giril_rl.rewards.adversarial import (
+    DiscriminatorConfig,
+    DiscriminatorScaling,
     RewardForm,
     adversarial_reward,
     discriminator_loss,
@@ -11,6 +13,7 @@ from giril_rl.rewards.bottleneck import (
     BottleneckConfig,
     BottleneckLoss,
     BottleneckReward,
+    bottleneck_loss,
     bottleneck_reward,
 )
 from giril_rl.rewards.controls import (
@@ -30,10 +33,8 @@ from giril_rl.rewards.curiosity import (
 )
 from giril_rl.rewards.discriminator import (
     AdversarialConfig,
-    DiscriminatorConfig,
     DiscriminatorLoss,
     DiscriminatorReward,
-    DiscriminatorScaling,
     discriminator_reward,
 )
 from giril_rl.rewards.factored import factored_error
@@ -95,6 +96,7 @@ __all__ = [
     "action_term",
     "adversarial_reward",
     "blend_action",
+    "bottleneck_loss",
     "bottleneck_reward",
     "copy_reward",
     "curiosity_reward",

@@ -20,29 +20,31 @@ from torchrl.envs import EnvBase
 
 from giril_rl.config.schema import knob
 from giril_rl.errors import UserError
-from giril_rl.networks.normalise import RunningNormaliser, running_statistics
+from giril_rl.networks.normalise import running_statistics
 from giril_rl.networks.pixels import FEATURES, PixelFeatures
 from giril_rl.networks.vectors import mlp
 from giril_rl.rewards.actions import ActionEncoder
-from giril_rl.rewards.adversarial import discriminator_loss, gradient_penalty, interpolated
-from giril_rl.rewards.discriminator import (
+from giril_rl.rewards.adversarial import (
     AdversarialLoss,
+    AdversarialReward,
     DiscriminatorConfig,
     DiscriminatorScaling,
+    discriminator_loss,
     discriminator_scaler,
+    gradient_penalty,
+    interpolated,
 )
 from giril_rl.rewards.method import SKY, Method, register
-from giril_rl.rewards.scaler import ObservationScaler, PixelScaler
+from giril_rl.rewards.scaler import PixelScaler
 from giril_rl.rewards.transitions import (
     REWARD_KEYS,
     TERMINATED,
     TRANSITION_KEYS,
-    TransitionReward,
     check_transitions,
     read,
     reward_for,
 )
-from giril_rl.runs.pretrained import Pretrained, remembered
+from giril_rl.runs.pretrained import remembered
 from giril_rl.runs.randomness import seeded
 
 LOG_PROB: NestedKey = "policy_log_prob"
@@ -107,7 +109,7 @@ def airl_logit(f: Tensor, log_prob: Tensor) -> Tensor:
     return f - log_prob
 
 
-class AIRLReward(Pretrained, TransitionReward):
+class AIRLReward(AdversarialReward):
     """AIRL's reward of observation, action, next observation and whether the step failed.
 
     Args:
@@ -136,9 +138,6 @@ class AIRLReward(Pretrained, TransitionReward):
         >>> reward(batch)["next", "intrinsic_reward"].shape
         torch.Size([4, 1])
     """
-
-    absorbing = None
-    """Absorbing states are not judged: the potential after a failure is 0."""
 
     def __init__(
         self,
@@ -194,7 +193,7 @@ class AIRLReward(Pretrained, TransitionReward):
             state_only: see the class.
             gamma: see the class.
             normalise: the observation's rule, see
-                :func:`~giril_rl.rewards.discriminator.discriminator_scaler`.
+                :func:`~giril_rl.rewards.adversarial.discriminator_scaler`.
             clamp: bound on each scaled observation; None has none.
             seed: seed of the weights. The global random state stays as it is.
             in_keys: see the class.
@@ -249,16 +248,6 @@ class AIRLReward(Pretrained, TransitionReward):
             in_keys=in_keys,
             out_keys=out_keys,
         )
-
-    def fit_scaler(self, observations: Tensor) -> None:
-        """Fits the scaler to the demonstration's ``(N, d)``, unless it follows the policy's."""
-        if isinstance(self.scaler, (ObservationScaler, PixelScaler)):
-            self.scaler.fit(observations)
-
-    def observe(self, observations: Tensor) -> None:
-        """Updates running statistics, if any, with the policy's observations ``(*batch, d)``."""
-        if isinstance(self.scaler, RunningNormaliser):
-            self.scaler.update(observations)
 
     def check(self, *transitions: Tensor) -> None:
         """Refuses entries of a wrong shape."""

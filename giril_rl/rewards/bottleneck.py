@@ -22,14 +22,17 @@ from giril_rl.errors import UserError
 from giril_rl.networks.pixels import SIDE, PixelBottleneck
 from giril_rl.networks.vectors import mlp
 from giril_rl.rewards.actions import ActionEncoder
-from giril_rl.rewards.adversarial import RewardForm, dual_step
+from giril_rl.rewards.adversarial import (
+    DiscriminatorScaling,
+    RewardForm,
+    discriminator_scaler,
+    dual_step,
+)
 from giril_rl.rewards.discriminator import (
     AdversarialConfig,
     DiscriminatorLoss,
     DiscriminatorReward,
-    DiscriminatorScaling,
     Sets,
-    discriminator_scaler,
 )
 from giril_rl.rewards.generative import gaussian_kl
 from giril_rl.rewards.method import PINK, Method, register
@@ -257,6 +260,24 @@ def bottleneck_reward(
     return reward
 
 
+def bottleneck_loss(reward: BottleneckReward, settings: BottleneckConfig) -> BottleneckLoss:
+    """VAIL's loss, as its settings have it.
+
+    Examples:
+        >>> from torchrl.data import Categorical
+        >>> reward = BottleneckReward.for_vectors(2, Categorical(3), normalise="raw")
+        >>> bottleneck_loss(reward, BottleneckConfig(beta_start=0.5)).beta
+        tensor(0.5000)
+    """
+    return BottleneckLoss(
+        reward,
+        information=settings.information,
+        beta_step=settings.beta_step,
+        beta=settings.beta_start,
+        penalty=settings.penalty,
+    )
+
+
 register(
     Method(
         "vail",
@@ -265,13 +286,7 @@ register(
         trained="beside",
         settings=BottleneckConfig,
         build=bottleneck_reward,
-        loss=lambda reward, settings: BottleneckLoss(
-            reward,
-            information=settings.information,
-            beta_step=settings.beta_step,
-            beta=settings.beta_start,
-            penalty=settings.penalty,
-        ),
+        loss=bottleneck_loss,
         rank=3,
     )
 )

@@ -81,13 +81,14 @@ def disagreement_reward(variance: Tensor, threshold: Tensor | float, form: Form)
     return torch.where(variance > threshold, -1.0, 1.0 if form == "sign" else 0.0)
 
 
-def bootstrapped(pairs: TensorDictBase, members: int, *, seed: int) -> TensorDictBase:
+def bootstrapped(pairs: TensorDictBase, members: int, *, seed: int | None) -> TensorDictBase:
     """``pairs`` with the :data:`BOOTSTRAP` counts of a sample with replacement for each member.
 
     Args:
         pairs: ``(n,)``; a shallow copy is returned.
         members: policies in the ensemble.
-        seed: of the samples. The global random state stays as it is.
+        seed: of the samples; the global random state stays as it is. None counts every transition
+            once for each member, as is right for held-out ones.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -96,6 +97,8 @@ def bootstrapped(pairs: TensorDictBase, members: int, *, seed: int) -> TensorDic
         tensor([9., 9.])
     """
     n = len(pairs)
+    if seed is None:
+        return pairs.clone(False).set(BOOTSTRAP, torch.ones(n, members, device=pairs.device))
     generator = torch.Generator().manual_seed(stream_seed("reward", seed))
     drawn = torch.randint(max(n, 1), (members, n), generator=generator)
     counts = torch.zeros(members, n).scatter_add(1, drawn, torch.ones(members, n))

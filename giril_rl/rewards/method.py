@@ -41,7 +41,7 @@ class Method:
         build: ``build(settings, env, pairs, seed=seed)`` makes the reward module, untrained, its
             scaler fitted to ``pairs``; None where there is no reward.
         loss: ``loss(reward, settings)`` is what its training minimises; None where it is never
-            trained.
+            trained, or not on single transitions.
         derive: of a control, ``derive(reward, moments, seed)`` makes its reward of the trained
             one; None where that one is used as it is.
         scope: what the reward of a transition depends on besides the reward's own state: the

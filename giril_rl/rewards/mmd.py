@@ -18,14 +18,8 @@ from torchrl.envs import EnvBase
 from giril_rl.config.schema import USE_ACTIONS, knob
 from giril_rl.errors import UserError
 from giril_rl.rewards.method import BLUE, Method, register
-from giril_rl.rewards.points import (
-    CLAMP,
-    USE_NEXT,
-    PointReward,
-    in_parts,
-    median_distance,
-    point_reward_for,
-)
+from giril_rl.rewards.point_reward import CLAMP, USE_NEXT, PointReward, point_reward_for
+from giril_rl.rewards.points import in_parts, median_distance
 from giril_rl.rewards.transitions import read
 
 Kept = Literal["recent", "all"]
@@ -149,10 +143,10 @@ class MMDReward(PointReward):
         visits: own visits kept at most.
         kept: "recent" ones, 1 in ``every``; or a uniform sample of "all".
         every: see ``kept``.
-        **points: see :class:`~giril_rl.rewards.points.PointReward`.
+        **points: see :class:`~giril_rl.rewards.point_reward.PointReward`.
 
     Raises:
-        UserError: for another ``kept``, and see :class:`~giril_rl.rewards.points.PointReward`.
+        UserError: for another ``kept``, and where the base class refuses.
 
     Examples:
         >>> from tensordict import TensorDict

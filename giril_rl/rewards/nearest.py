@@ -17,15 +17,8 @@ from torchrl.envs import EnvBase
 from giril_rl.config.schema import USE_ACTIONS, knob
 from giril_rl.errors import UserError
 from giril_rl.rewards.method import PINK, Method, register
-from giril_rl.rewards.points import (
-    CLAMP,
-    EXACT,
-    USE_NEXT,
-    PointReward,
-    in_parts,
-    median_distance,
-    point_reward_for,
-)
+from giril_rl.rewards.point_reward import CLAMP, USE_NEXT, PointReward, point_reward_for
+from giril_rl.rewards.points import EXACT, in_parts, median_distance
 
 NearestKernel = Literal["quadratic", "gaussian"]
 
@@ -103,10 +96,10 @@ class NearestReward(PointReward):
 
     Args:
         kernel: see :func:`nearest_reward`.
-        **points: see :class:`~giril_rl.rewards.points.PointReward`.
+        **points: see :class:`~giril_rl.rewards.point_reward.PointReward`.
 
     Raises:
-        UserError: for an unknown kernel, and see :class:`~giril_rl.rewards.points.PointReward`.
+        UserError: for an unknown kernel, and where the base class refuses.
 
     Examples:
         >>> from tensordict import TensorDict

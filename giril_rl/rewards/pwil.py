@@ -20,9 +20,9 @@ from torchrl.envs import EnvBase
 
 from giril_rl.config.schema import USE_ACTIONS, knob
 from giril_rl.errors import UserError
-from giril_rl.rewards.atoms import Atoms, check_vectors, spaces_of
 from giril_rl.rewards.method import GREEN, Method, register
-from giril_rl.rewards.trajectory import TrajectoryReward
+from giril_rl.rewards.points import Atoms
+from giril_rl.rewards.trajectory import TrajectoryReward, check_vectors, spaces_of
 from giril_rl.rewards.transitions import REWARD_KEYS
 from giril_rl.runs.pretrained import remembered
 

@@ -21,9 +21,9 @@ from torchrl.envs import EnvBase
 
 from giril_rl.config.schema import USE_ACTIONS, knob
 from giril_rl.errors import UserError
-from giril_rl.rewards.atoms import Atoms, check_vectors, spaces_of
 from giril_rl.rewards.method import SKY, Method, register
-from giril_rl.rewards.trajectory import TrajectoryReward
+from giril_rl.rewards.points import EXACT, Atoms
+from giril_rl.rewards.trajectory import TrajectoryReward, check_vectors, spaces_of
 from giril_rl.rewards.transitions import REWARD_KEYS
 from giril_rl.runs.pretrained import remembered
 
@@ -66,7 +66,7 @@ def pairwise_cost(x: Tensor, y: Tensor, cost: Cost = "euclidean") -> Tensor:
     """
     if cost == "cosine":
         return 1 - F.normalize(x, dim=-1) @ F.normalize(y, dim=-1).T
-    return torch.cdist(x, y, compute_mode="donot_use_mm_for_euclid_dist")
+    return torch.cdist(x, y, compute_mode=EXACT)
 
 
 def sinkhorn_plan(cost: Tensor, regularisation: float, iterations: int = 100) -> Tensor:

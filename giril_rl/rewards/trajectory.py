@@ -12,10 +12,12 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
+from torchrl.data import TensorSpec
+from torchrl.envs import EnvBase
 
 from giril_rl.errors import UserError
-from giril_rl.rewards.atoms import Atoms
-from giril_rl.rewards.transitions import REWARD_KEYS, check_states, read
+from giril_rl.rewards.points import Atoms
+from giril_rl.rewards.transitions import REWARD_KEYS, check_states, observation_shape, read
 from giril_rl.runs.pretrained import Pretrained
 
 NEXT, DONE = ("next", "observation"), ("next", "done")
@@ -224,3 +226,34 @@ def fresh_episodes(part: nn.Module, *, learn: bool = False) -> Iterator[None]:
 def trajectory_rewards(part: nn.Module) -> list[TrajectoryReward]:
     """The trajectory rewards inside a transform or a reward, outermost first."""
     return [module for module in part.modules() if isinstance(module, TrajectoryReward)]
+
+
+def check_vectors(what: str, observation: str) -> None:
+    """Refuses a task that does not show vectors.
+
+    Args:
+        what: the method's name.
+        observation: what the task shows, "vector" or "image".
+
+    Examples:
+        >>> check_vectors("PWIL", "image")
+        Traceback (most recent call last):
+        giril_rl.errors.UserError: PWIL measures distances of vectors and this task shows images:
+        choose a task of vectors, or another method.
+    """
+    if observation != "vector":
+        raise UserError(
+            f"{what} measures distances of vectors and this task shows images: choose a task of "
+            "vectors, or another method."
+        )
+
+
+def spaces_of(what: str, env: EnvBase, use_actions: bool) -> tuple[int, TensorSpec | None]:
+    """Size of an environment's observations, and its action spec, None without ``use_actions``.
+
+    Raises:
+        UserError: if the environment shows images; ``what`` names the method.
+    """
+    frames, size = observation_shape(env)
+    check_vectors(what, "image" if frames else "vector")
+    return size, env.action_spec if use_actions else None

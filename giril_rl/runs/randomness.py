@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 CPU = torch.device("cpu")
-Use = Literal["player", "demonstration", "training", "evaluation", "reward"]
+Use = Literal["player", "demonstration", "training", "evaluation", "reward", "ranking"]
 _USES = get_args(Use)
 
 

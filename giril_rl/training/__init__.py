@@ -11,7 +11,7 @@ from giril_rl.training.baselines import (
     held_action_scores,
 )
 from giril_rl.training.cloning import clone_behaviour
-from giril_rl.training.cloning_beside import CloningTrainer
+from giril_rl.training.cloning_beside import CloningTrainer, make_cloning
 from giril_rl.training.demonstrations import check_inputs, obtain_demonstration, open_run
 from giril_rl.training.experts import check_task, train_expert
 from giril_rl.training.fitting import fit_reward
@@ -54,6 +54,7 @@ __all__ = [
     "load_agent",
     "make_agent",
     "make_algorithm",
+    "make_cloning",
     "obtain_demonstration",
     "open_run",
     "return_scaling",

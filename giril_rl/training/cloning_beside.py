@@ -8,6 +8,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
+from giril_rl.rewards.dril import DisagreementConfig
 from giril_rl.runs.randomness import stream_seed
 
 
@@ -101,3 +102,26 @@ class CloningTrainer:
         self.optimizer.load_state_dict(state["optimizer"])
         self._generator.set_state(state["generator"])
         self._taken = state["taken"]
+
+
+def make_cloning(
+    agent: Imitator, pairs: TensorDictBase, settings: DisagreementConfig, *, seed: int
+) -> CloningTrainer | None:
+    """DRIL's cloning beside, as its settings have it; None where they leave it out.
+
+    Args:
+        agent: see :class:`CloningTrainer`.
+        pairs: see there.
+        settings: DRIL's, of which ``bc_every``, ``bc_batch`` and ``bc_lr`` are read.
+        seed: see there.
+    """
+    if settings.bc_every is None:
+        return None
+    return CloningTrainer(
+        agent,
+        pairs,
+        every=settings.bc_every,
+        batch=settings.bc_batch,
+        lr=settings.bc_lr,
+        seed=seed,
+    )

@@ -199,14 +199,15 @@ class _RewardFit:
     def losses(self, steps: int) -> dict[str, float]:
         """The loss's terms on each set, with noise that leaves the run's random numbers alone.
 
-        Of frames only the first, for they would take seconds and gigabytes.
+        Of frames and of snippets only the first, for they would take seconds and gigabytes.
         """
         values: dict[str, float] = {}
         self.loss.eval()
         for name, data in self.sets.items():
             with torch.no_grad(), seeded(0, self.device):
-                frames = data.get("observation").ndim > 2
-                for key, value in self.loss(data[:PIXELS_AT_ONCE] if frames else data).items():
+                observation = data.get("observation", None)
+                large = observation is None or observation.ndim > 2
+                for key, value in self.loss(data[:PIXELS_AT_ONCE] if large else data).items():
                     term = str(key).removeprefix("loss_")
                     values[f"fit/{name}/{term}"] = value.item()
         return values

@@ -52,6 +52,7 @@ def finish_run(
     demo: Demonstration | None = None,
     seeds: dict[str, int] | None = None,
     reward: nn.Module | None = None,
+    more: dict[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Scores the policy on fresh environments and writes policy, curve and ``result.json``.
 
@@ -66,6 +67,7 @@ def finish_run(
         seeds: seeds besides those of policy, evaluation, expert and demonstration; None takes the
             reward model's, if there is a reward.
         reward: the reward module, if there is one; kept beside the policy if it can be.
+        more: further entries of ``result.json``, plain JSON values.
 
     Returns:
         What ``result.json`` holds.
@@ -106,6 +108,7 @@ def finish_run(
         "processor": processor(),
         "finished_at": datetime.now(UTC).isoformat(timespec="seconds"),
         **_untrained(agent),
+        **(more or {}),
     }
     card = {key: result[key] for key in CARD_KEYS}
     for folder, module in ((POLICY, agent), (REWARD, reward)):

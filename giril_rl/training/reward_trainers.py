@@ -12,7 +12,7 @@ from torch import Tensor
 from torchrl.envs import Transform
 
 from giril_rl.graphs.gradients import TracedGradients
-from giril_rl.rewards.discriminator import AdversarialLoss, DiscriminatorConfig
+from giril_rl.rewards.adversarial import AdversarialLoss, DiscriminatorConfig
 from giril_rl.rewards.transitions import TERMINATED
 from giril_rl.runs.randomness import restore_rng, rng_state, seeded, stream_seed
 from giril_rl.transforms.absorbing import AbsorbingReward

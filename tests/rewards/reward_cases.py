@@ -123,7 +123,7 @@ def registered_cases() -> list[Case]:
         if method.build is None or method.scope == "trajectory":  # Those have checks of their own.
             continue
         kinds = ("box", "discrete", "pixels") if method.kind == "method" else ("box",)
-        for kind in kinds:
+        for kind in kinds[: 2 if not method.frames else 3]:
             build = functools.partial(of_method, method, kind)
             noisy = isinstance(build(Setting(Categorical(4), PLAIN, 0)), NoiseReward)
             case = Case(f"{name}-{kind}", build, kind, None, not noisy, False, method.scope)

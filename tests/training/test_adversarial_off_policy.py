@@ -3,7 +3,8 @@
 import gymnasium
 import pytest
 import torch
-from random_pairs import assert_equal, pairs
+from nested_state import assert_equal
+from random_pairs import pairs
 from short_runs import Garbage, Killed, rows, stopped
 from tensordict import TensorDict
 from torchrl.data import Bounded

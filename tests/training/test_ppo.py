@@ -1,6 +1,7 @@
 from functools import partial
 
 import gymnasium
+import nested_state
 import numpy as np
 import pytest
 import torch
@@ -28,6 +29,8 @@ BULLET = "InvertedPendulumBulletEnv-v0"
 SMALL = {"num_envs": 4, "rollout": 32, "minibatch": 64, "epochs": 2, "hidden": [16, 16]}
 BATCH = 4 * 32
 
+assert_equal = partial(nested_state.assert_equal, equal_nan=True)
+
 
 def config(**kwargs):
     return PPOConfig(**{**SMALL, "checkpoint_every": 2 * BATCH, **kwargs})
@@ -45,25 +48,6 @@ def learned_reward(env, *, beta=1.0, batch_mean=True, seed=0):
     )
     mean = [BatchMeanReward()] if batch_mean else []
     return Compose(IntrinsicReward(reward), *mean, ReturnScaling(0.99))
-
-
-def assert_equal(found, expected, path=""):
-    """Nested state, bit for bit."""
-    assert type(found) is type(expected), path
-    if isinstance(found, dict):
-        assert found.keys() == expected.keys(), path
-        for key in found:
-            assert_equal(found[key], expected[key], f"{path}.{key}")
-    elif isinstance(found, list):
-        assert len(found) == len(expected), path
-        for i, (one, other) in enumerate(zip(found, expected, strict=True)):
-            assert_equal(one, other, f"{path}.{i}")
-    elif isinstance(found, torch.Tensor):
-        assert found.dtype == expected.dtype and found.shape == expected.shape, path
-        both_nan = found.isnan() & expected.isnan() if found.is_floating_point() else False
-        assert ((found == expected) | both_nan).all(), path
-    else:
-        assert found == expected, path
 
 
 # Advantages

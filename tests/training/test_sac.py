@@ -6,6 +6,7 @@ from dataclasses import replace
 import gymnasium
 import pytest
 import torch
+from nested_state import assert_equal
 from short_runs import Garbage, Killed, rows, stopped
 from tensordict import TensorDict
 from torchrl.data import Bounded, Categorical, OneHot, Unbounded
@@ -74,23 +75,6 @@ def train(folder, *, kind="box", garbage=None, moving=False, whole=False, known=
         state = run.load("sac")
     state.pop("seconds")
     return state
-
-
-def assert_equal(found, expected, path=""):
-    """Nested state, bit for bit."""
-    assert type(found) is type(expected), path
-    if isinstance(found, dict):
-        assert found.keys() == expected.keys(), path
-        for key in found:
-            assert_equal(found[key], expected[key], f"{path}.{key}")
-    elif isinstance(found, list):
-        assert len(found) == len(expected), path
-        for i, (one, other) in enumerate(zip(found, expected, strict=True)):
-            assert_equal(one, other, f"{path}.{i}")
-    elif isinstance(found, torch.Tensor):
-        assert found.dtype == expected.dtype and torch.equal(found, expected), path
-    else:
-        assert found == expected, path
 
 
 # Runs

@@ -33,7 +33,11 @@ def made(tmp_path):
         method = f"control:{config.reward}" if recipe == "control" else recipe
         trained = 0 if method in ("bc", "control:random") else config.steps
         rows = [
-            {"phase": config.algorithm, "step": trained * i // 4, "train/return_mean": i * (score or 1.0) / 4}
+            {
+                "phase": config.algorithm,
+                "step": trained * i // 4,
+                "train/return_mean": i * (score or 1.0) / 4,
+            }
             for i in range(1, 5)
             if trained
         ]

@@ -18,7 +18,7 @@ from giril_rl.experiments.report.pictures import draw_predictions, is_generative
 from giril_rl.experiments.report.reading import read_runs
 from giril_rl.experiments.report.tables import panels_of
 from giril_rl.rewards import GenerativeConfig, GenerativeReward
-from giril_rl.runs.finished import read_config, read_part, read_settings
+from giril_rl.runs.finished import read_config, read_part, read_result, read_settings
 from giril_rl.runs.identity import config_hash
 from giril_rl.training import make_agent
 from giril_rl.training.demonstrations import demonstration_place
@@ -33,7 +33,7 @@ def run(made):
     pytest.importorskip("ale_py")
 
     def write(recipe, *words):
-        folder = made(recipe, *WORDS, *words, score=1.0, demo_transitions=9)
+        folder = made(recipe, *WORDS, *words, score=1.0, demo_transitions=18)
         config = read_config(folder)
         env = make_env(read_settings(folder)[0], 1, seed=0)
         make_agent(env, PPOConfig(), seed=0).save_pretrained(folder / "policy")
@@ -56,8 +56,9 @@ def record(root, folder):
     cfg = RunConfig(task=task, seed=config["seed"])
     made_by = config_hash(expert_settings(cfg, expert))
     recorded = record_demonstration(
-        gym_factory(task), lambda seen: seen.new_zeros(1).long(), seed=0, length=9, lives="first"
+        gym_factory(task), lambda seen: seen.new_zeros(1).long(), seed=0, episodes=1, lives="first"
     )
+    assert len(recorded) == read_result(folder)["demo_transitions"]
     recorded.save(root / demonstration_place(cfg, demo, made_by))
 
 
