@@ -82,10 +82,7 @@ def main(cfg: Config, out: Path) -> None:
         fit_reward(loss, fitted, cfg.fit, seed=seed, run=run, validation=unseen)
         reward.calibrate(played)
 
-        transform = Compose(
-            IntrinsicReward(reward),
-            *return_scaling(cfg),
-        )
+        transform = Compose(IntrinsicReward(reward), *return_scaling(cfg))
         learner = make_algorithm(env, cfg, run=run, demo=demo, transform=transform)
         trained = train_policy(env, learner, transform, seed=cfg.seed, run=run)
         finish_run(
