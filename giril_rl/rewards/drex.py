@@ -75,7 +75,8 @@ class DREXConfig:
     def check(self, prefix: str, run: Any) -> None:
         """Refuses frames and a margin that no pair has, before anything is trained."""
         refuse_frames(run.task.family.observation)
-        widest = 1 - 1 / run.ranking.levels
+        ranking = getattr(run, "ranking", None)  # A recipe of one's own may rank otherwise.
+        widest = 1.0 if ranking is None else 1 - 1 / ranking.levels
         if self.margin > widest + 1e-6:
             raise UserError(
                 f"{prefix}margin={self.margin} is more than any two of the noise levels differ: "

@@ -114,7 +114,7 @@ class RankedEpisodes:
         correlation = float(spearmanr(-self.noise, self.returns).statistic) if varied else None
         return {
             "steps": int(self.lengths.sum()),
-            "noise": [round(level, 6) for level in levels.tolist()],
+            "noise": levels.tolist(),
             "return_means": means,
             "rank_correlation": correlation,
         }
@@ -249,7 +249,8 @@ def ranked_episodes(
             return RankedEpisodes.from_state(saved)
     agent, seconds = _clone(pairs, task, clone, seed, run, validation, device)
     began = time.perf_counter() - seconds
-    noise = torch.arange(settings.levels).repeat_interleave(settings.episodes) / settings.levels
+    levels = torch.arange(settings.levels, dtype=torch.float64) / settings.levels
+    noise = levels.repeat_interleave(settings.episodes)
     played = play_with_noise(agent.acting(), task, noise, seed=seed)
     run.truncate_metrics(RANKING, -1)
     for level in noise.unique():
