@@ -23,7 +23,7 @@ from giril_rl.errors import UserError
 from giril_rl.networks.ensembles import EnsembleLinear, EnsembleMLP
 from giril_rl.rewards.actions import ActionEncoder
 from giril_rl.rewards.fitting import RewardLoss
-from giril_rl.rewards.method import GREY, Method, register
+from giril_rl.rewards.method import PINK, Method, register
 from giril_rl.rewards.preferences import preference_loss
 from giril_rl.rewards.scaler import ObservationScaler, ScalingRule
 from giril_rl.rewards.transitions import (
@@ -303,7 +303,7 @@ register(
     Method(
         "drex",
         "D-REX",
-        GREY,
+        PINK,
         settings=DREXConfig,
         build=drex_reward,
         frames=False,
