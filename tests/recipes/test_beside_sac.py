@@ -75,6 +75,7 @@ def test_sqil_refuses_what_leaves_nothing_of_it(change, sentence, root, tmp_path
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.slow
 def test_each_term_of_ilde_can_be_switched_off(root, tmp_path):
     off = {
         "imitation": "reward.imitation=none",

@@ -198,7 +198,11 @@ def test_noise_is_averaged_over_environments_in_the_released_profile(root, tmp_p
     assert weights(tmp_path / "released") != weights(tmp_path / "paper")
 
 
-@pytest.mark.parametrize("words", [["control", "reward=noise"], ["cdil"]], ids=lambda w: w[0])
+@pytest.mark.parametrize(
+    "words",
+    [["control", "reward=noise"], pytest.param(["cdil"], marks=pytest.mark.slow)],
+    ids=lambda w: w[0],
+)
 def test_a_run_that_died_ends_as_an_undisturbed_one(words, root, tmp_path, monkeypatch, capsys):
     recipe, *more = words
     run(recipe, tmp_path / "whole", root, *more)

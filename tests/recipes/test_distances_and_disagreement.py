@@ -47,7 +47,7 @@ def words(recipe, out, root, *more, algorithm="sac"):
     return ["run", recipe, *{word.split("=")[0]: word for word in known}.values()]
 
 
-@pytest.mark.parametrize("algorithm", ["ppo", "sac"])
+@pytest.mark.parametrize("algorithm", [pytest.param("ppo", marks=pytest.mark.slow), "sac"])
 @pytest.mark.parametrize("recipe", RECIPES)
 def test_from_command_to_result_and_resumed_bit_for_bit(recipe, algorithm, root, tmp_path):
     assert main(words(recipe, tmp_path / "whole", root, algorithm=algorithm)) == 0

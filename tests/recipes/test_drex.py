@@ -60,7 +60,7 @@ def interrupted(folder, root, phase, step, algorithm="sac"):
         assert main(words(folder, root, algorithm=algorithm)) == 1
 
 
-@pytest.fixture(scope="module", params=["ppo", "sac"])
+@pytest.fixture(scope="module", params=[pytest.param("ppo", marks=pytest.mark.slow), "sac"])
 def whole(request, root, tmp_path_factory):
     folder = tmp_path_factory.mktemp("whole") / "run"
     assert main(words(folder, root, algorithm=request.param)) == 0
@@ -83,7 +83,13 @@ def test_from_command_to_result(whole):
 
 
 @pytest.mark.parametrize(
-    ("phase", "step"), [("clone", 20), ("ranking", 1), ("fit", 10), (None, 100)]
+    ("phase", "step"),
+    [
+        pytest.param("clone", 20, marks=pytest.mark.slow),
+        ("ranking", 1),
+        pytest.param("fit", 10, marks=pytest.mark.slow),
+        (None, 100),
+    ],
 )
 def test_resumed_bit_for_bit(phase, step, whole, root, tmp_path):
     algorithm, folder = whole

@@ -39,9 +39,9 @@ def run(recipe, out, root, *more):
     ("recipe", "more"),
     [
         ("pwil", ()),
-        ("pwil", PPO),
+        pytest.param("pwil", PPO, marks=pytest.mark.slow),
         ("sinkhorn", ()),
-        ("sinkhorn", PPO),
+        pytest.param("sinkhorn", PPO, marks=pytest.mark.slow),
     ],
 )
 def test_a_run_stopped_in_mid_episode_ends_as_an_undisturbed_one(recipe, more, root, tmp_path):

@@ -192,7 +192,9 @@ def train(folder, *, method="gail", kind="discrete", garbage=None, steps=4 * BAT
     return state
 
 
-@pytest.mark.parametrize(("method", "kind"), [("gail", "discrete"), ("vail", "box")])
+@pytest.mark.parametrize(
+    ("method", "kind"), [pytest.param("gail", "discrete", marks=pytest.mark.slow), ("vail", "box")]
+)
 def test_a_run_stopped_again_and_again_ends_bit_for_bit_as_an_undisturbed_one(
     method, kind, tmp_path
 ):

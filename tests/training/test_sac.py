@@ -83,10 +83,12 @@ def train(folder, *, kind="box", garbage=None, moving=False, whole=False, known=
 @pytest.mark.parametrize(
     ("kind", "settings"),
     [
-        ("discrete", {}),
+        pytest.param("discrete", {}, marks=pytest.mark.slow),
         ("box", {"moving": True}),
         ("box", {"whole": True}),
-        ("box", {"entropy": "none", "normalise_observations": True}),
+        pytest.param(
+            *("box", {"entropy": "none", "normalise_observations": True}), marks=pytest.mark.slow
+        ),
     ],
 )
 def test_a_run_stopped_again_and_again_ends_bit_for_bit_as_an_undisturbed_one(
@@ -107,7 +109,7 @@ def test_a_run_stopped_again_and_again_ends_bit_for_bit_as_an_undisturbed_one(
 
 
 @pytest.mark.parametrize("moving", [False, True])
-@pytest.mark.parametrize("kind", ENVS)
+@pytest.mark.parametrize("kind", [pytest.param("discrete", marks=pytest.mark.slow), "box"])
 def test_the_learner_cannot_see_the_true_reward(kind, moving, tmp_path):
     settings = {"kind": kind, "moving": moving, "known": True}
     expected = train(tmp_path / "true", **settings)
