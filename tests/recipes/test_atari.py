@@ -29,6 +29,8 @@ TINY = {
 IMITATION = {"demo.subsample": 2}
 FIT = {**IMITATION, "fit.steps": 4, "fit.batch": 4, "fit.log_every": 2}
 ADVERSARIAL = {**IMITATION, "reward.updates": 1, "reward.batch": 8}
+QUICK = ("giril", "bc", "control")
+"""The others are slow tests, and CI runs every recipe besides."""
 RECIPES = {
     "giril": FIT,
     "cdil": FIT,
@@ -59,7 +61,9 @@ def run(recipe, out, root, **more):
     return json.loads((out / "result.json").read_text())
 
 
-@pytest.mark.parametrize("recipe", RECIPES)
+@pytest.mark.parametrize(
+    "recipe", [r if r in QUICK else pytest.param(r, marks=pytest.mark.slow) for r in RECIPES]
+)
 def test_each_recipe_leaves_a_whole_result(recipe, expert, root, tmp_path):
     result = run(recipe, tmp_path, root, **{"expert.path": expert})
     steps = 0 if recipe == "bc" else 2 * BATCH

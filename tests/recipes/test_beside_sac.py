@@ -24,6 +24,8 @@ TINY = [
     "logger=null",
     "task.env_id=CartPole-v1",
 ]
+QUICK = ("gail", "sqil")
+"""The others are slow tests, and CI runs every recipe besides."""
 RECIPES = {
     "gail": ["reward.hidden=[8]"],
     "vail": ["reward.hidden=[8]", "reward.form=negative"],
@@ -46,7 +48,9 @@ def run(recipe, out, root, *more):
     return main(["run", recipe, *{word.split("=")[0]: word for word in words}.values()])
 
 
-@pytest.mark.parametrize("recipe", RECIPES)
+@pytest.mark.parametrize(
+    "recipe", [r if r in QUICK else pytest.param(r, marks=pytest.mark.slow) for r in RECIPES]
+)
 def test_a_recipe_leaves_a_whole_result(recipe, root, tmp_path):
     assert run(recipe, tmp_path / "run", root) == 0
     result = json.loads((tmp_path / "run" / "result.json").read_text())

@@ -26,6 +26,8 @@ LEARNERS = {
     ],
 }
 DRIL = ["fit.steps=20", "fit.log_every=10", "reward.hidden=[16]", "reward.bc_every=50"]
+QUICK = ("mmd", "dril")
+"""The others are slow tests, and CI runs every recipe besides."""
 RECIPES = {
     "nearest": [],
     "mmd": ["reward.visits=20", "reward.kept=all"],
@@ -48,7 +50,9 @@ def words(recipe, out, root, *more, algorithm="sac"):
 
 
 @pytest.mark.parametrize("algorithm", [pytest.param("ppo", marks=pytest.mark.slow), "sac"])
-@pytest.mark.parametrize("recipe", RECIPES)
+@pytest.mark.parametrize(
+    "recipe", [r if r in QUICK else pytest.param(r, marks=pytest.mark.slow) for r in RECIPES]
+)
 def test_from_command_to_result_and_resumed_bit_for_bit(recipe, algorithm, root, tmp_path):
     assert main(words(recipe, tmp_path / "whole", root, algorithm=algorithm)) == 0
     result = json.loads((tmp_path / "whole" / "result.json").read_text())

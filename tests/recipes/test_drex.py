@@ -86,7 +86,7 @@ def test_from_command_to_result(whole):
     ("phase", "step"),
     [
         pytest.param("clone", 20, marks=pytest.mark.slow),
-        ("ranking", 1),
+        pytest.param("ranking", 1, marks=pytest.mark.slow),
         pytest.param("fit", 10, marks=pytest.mark.slow),
         (None, 100),
     ],

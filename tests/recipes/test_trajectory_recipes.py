@@ -40,7 +40,7 @@ def run(recipe, out, root, *more):
     [
         ("pwil", ()),
         pytest.param("pwil", PPO, marks=pytest.mark.slow),
-        ("sinkhorn", ()),
+        pytest.param("sinkhorn", (), marks=pytest.mark.slow),
         pytest.param("sinkhorn", PPO, marks=pytest.mark.slow),
     ],
 )
