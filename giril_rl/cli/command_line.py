@@ -134,7 +134,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     Examples:
         >>> main(["ls"])
-        bc ...
+        airl ...
         0
     """
     words = list(sys.argv[1:] if argv is None else argv)

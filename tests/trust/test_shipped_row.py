@@ -32,8 +32,10 @@ def made_here(run):
     digest = hashlib.sha256()
     for part in ("policy", "reward"):
         weights = load_file(run / part / "model.safetensors")
-        for name in sorted(weights):
-            digest.update(name.encode() + weights[name].contiguous().numpy().tobytes())
+        # A file numbers its tensors, and their order decides nothing.
+        named = {name.partition(":")[2]: weight for name, weight in weights.items()}
+        for name in sorted(named):
+            digest.update(name.encode() + named[name].contiguous().numpy().tobytes())
     fit, first, _ = read_metrics(run / "metrics.jsonl")
     versions = installed_versions()
     return {
