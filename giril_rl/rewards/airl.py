@@ -393,9 +393,7 @@ def airl_reward(
     gamma = 0.99 if settings.gamma is None else settings.gamma
     settings = replace(settings, form=settings.form or "f", gamma=gamma)
     shared, own = "form state_only gamma", "hidden normalise clamp"
-    reward = reward_for(env, AIRLReward, settings, seed=seed, of_all=shared, of_vectors=own)
-    reward.fit_scaler(pairs.get("observation"))
-    return reward
+    return reward_for(env, AIRLReward, settings, pairs, seed=seed, of_all=shared, of_vectors=own)
 
 
 register(

@@ -255,9 +255,9 @@ def bottleneck_reward(
     """VAIL's reward; arguments as :func:`~giril_rl.rewards.discriminator_reward` has them."""
     settings = replace(settings, absorbing=bool(settings.absorbing))
     shared, own = "form absorbing use_actions latent", "hidden normalise clamp"
-    reward = reward_for(env, BottleneckReward, settings, seed=seed, of_all=shared, of_vectors=own)
-    reward.fit_scaler(pairs.get("observation"))
-    return reward
+    return reward_for(
+        env, BottleneckReward, settings, pairs, seed=seed, of_all=shared, of_vectors=own
+    )
 
 
 def bottleneck_loss(reward: BottleneckReward, settings: BottleneckConfig) -> BottleneckLoss:

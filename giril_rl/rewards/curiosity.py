@@ -364,9 +364,9 @@ def curiosity_reward(
         ObservationScaler(4, rule='standardise', clamp=True)
     """
     every, own = "scale use_actions", "hidden model_hidden normalise clamp"
-    reward = reward_for(env, CuriosityReward, settings, seed=seed, of_all=every, of_vectors=own)
-    reward.scaler.fit(pairs.get("observation"))
-    return reward
+    return reward_for(
+        env, CuriosityReward, settings, pairs, seed=seed, of_all=every, of_vectors=own
+    )
 
 
 register(

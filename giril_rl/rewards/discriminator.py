@@ -461,11 +461,9 @@ def discriminator_reward(
     """
     settings = replace(settings, absorbing=bool(settings.absorbing))
     shared, own = "form absorbing use_actions", "hidden normalise clamp"
-    reward = reward_for(
-        env, DiscriminatorReward, settings, seed=seed, of_all=shared, of_vectors=own
+    return reward_for(
+        env, DiscriminatorReward, settings, pairs, seed=seed, of_all=shared, of_vectors=own
     )
-    reward.fit_scaler(pairs.get("observation"))
-    return reward
 
 
 register(

@@ -294,9 +294,7 @@ def drex_reward(
     """
     refuse_frames("image" if observation_shape(env)[0] else "vector")
     own = "members hidden clip normalise clamp use_actions"
-    reward = reward_for(env, DREXReward, settings, seed=seed, of_all="", of_vectors=own)
-    reward.scaler.fit(pairs.get("observation"))
-    return reward
+    return reward_for(env, DREXReward, settings, pairs, seed=seed, of_all="", of_vectors=own)
 
 
 register(

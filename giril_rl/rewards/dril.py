@@ -340,9 +340,9 @@ def dril_reward(
         ObservationScaler(4, rule='standardise', clamp=True)
     """
     shared, own = "members hidden variance form", "normalise clamp"
-    reward = reward_for(env, DisagreementReward, settings, seed=seed, of_all=shared, of_vectors=own)
-    reward.scaler.fit(pairs.get("observation"))
-    return reward
+    return reward_for(
+        env, DisagreementReward, settings, pairs, seed=seed, of_all=shared, of_vectors=own
+    )
 
 
 register(

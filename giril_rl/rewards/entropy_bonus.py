@@ -238,11 +238,9 @@ def entropy_bonus(
         >>> entropy_bonus(EntropyBonusConfig(), GymEnv("CartPole-v1"), pairs).scaler
         ObservationScaler(4, rule='standardise', clamp=False)
     """
-    reward = reward_for(
-        env, EntropyBonus, settings, seed=seed, of_all="k among", of_vectors="normalise"
+    return reward_for(
+        env, EntropyBonus, settings, pairs, seed=seed, of_all="k among", of_vectors="normalise"
     )
-    reward.scaler.fit(pairs.get("observation"))
-    return reward
 
 
 register(

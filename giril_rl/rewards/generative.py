@@ -510,12 +510,10 @@ def generative_reward(
         >>> generative_reward(GenerativeConfig(), GymEnv("CartPole-v1"), pairs, seed=0).scaler
         ObservationScaler(4, rule='standardise', clamp=True)
     """
-    every = "beta scale prior clamp use_actions"
-    reward = reward_for(
-        env, GenerativeReward, settings, seed=seed, of_all=every, of_vectors="hidden normalise"
+    every, own = "beta scale prior clamp use_actions", "hidden normalise"
+    return reward_for(
+        env, GenerativeReward, settings, pairs, seed=seed, of_all=every, of_vectors=own
     )
-    reward.scaler.fit(pairs.get("observation"))
-    return reward
 
 
 register(

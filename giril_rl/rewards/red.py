@@ -334,9 +334,9 @@ def red_reward(
     """
     settings = replace(settings, sigma=settings.sigma or 1.0)  # Until it is calibrated.
     shared, own = "features sigma use_actions", "hidden normalise clamp"
-    reward = reward_for(env, DistillationReward, settings, seed=seed, of_all=shared, of_vectors=own)
-    reward.scaler.fit(pairs.get("observation"))
-    return reward
+    return reward_for(
+        env, DistillationReward, settings, pairs, seed=seed, of_all=shared, of_vectors=own
+    )
 
 
 register(

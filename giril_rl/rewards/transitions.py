@@ -94,6 +94,10 @@ class TransitionReward(TensorDictModuleBase):
         """Refuses entries of a wrong shape or encoding, see :func:`check_transitions`."""
         check_transitions(self.scaler, self.actions, *transitions)
 
+    def fit_scaler(self, observations: Tensor) -> None:
+        """Fits the scaler to observations of the demonstration."""
+        self.scaler.fit(observations)
+
     def values(self, *transitions: Tensor) -> Tensor:
         """The rewards ``(*batch,)`` of the entries under ``in_keys``."""
         return per_transition(self.value, transitions, getattr(self.scaler, "event_dims", 1))
@@ -194,14 +198,24 @@ def observation_shape(env: EnvBase) -> tuple[int, int]:
 
 
 def reward_for(
-    env: EnvBase, kind: Any, settings: Any, *, seed: int, of_all: str, of_vectors: str
+    env: EnvBase,
+    kind: Any,
+    settings: Any,
+    pairs: TensorDictBase,
+    *,
+    seed: int,
+    of_all: str,
+    of_vectors: str,
 ) -> Any:
     """``kind.for_pixels`` or ``kind.for_vectors``, as the environment's observations need.
+
+    Its scaler is fitted to ``pairs``.
 
     Args:
         env: the environment, for its specs.
         kind: the reward's class.
         settings: its settings.
+        pairs: the demonstrated transitions to learn from.
         seed: the reward's seed, of which its random numbers' own seed is made.
         of_all: names of the settings that both constructors take as arguments.
         of_vectors: names of those that only ``for_vectors`` takes.
@@ -210,6 +224,9 @@ def reward_for(
     arguments = {name: getattr(settings, name) for name in of_all.split()}
     arguments["seed"] = stream_seed("reward", seed)
     if frames:
-        return kind.for_pixels(env.action_spec, channels=frames, **arguments)
-    arguments |= {name: getattr(settings, name) for name in of_vectors.split()}
-    return kind.for_vectors(size, env.action_spec, **arguments)
+        reward = kind.for_pixels(env.action_spec, channels=frames, **arguments)
+    else:
+        arguments |= {name: getattr(settings, name) for name in of_vectors.split()}
+        reward = kind.for_vectors(size, env.action_spec, **arguments)
+    reward.fit_scaler(pairs.get("observation"))
+    return reward
