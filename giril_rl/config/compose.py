@@ -24,6 +24,7 @@ from giril_rl.config.families import GYMNASIUM, family_of
 from giril_rl.config.knobs import default_text, flat
 from giril_rl.config.overrides import KeyCheck, normalised, parse, words_by_key
 from giril_rl.config.recipes import Recipe, first_line, load_yaml, shipped_conf
+from giril_rl.config.schema import RunConfig, idle_algorithm
 from giril_rl.config.tasks import apply_task_defaults
 from giril_rl.config.validation import validate
 from giril_rl.errors import UserError
@@ -267,13 +268,14 @@ def resolved(recipe: Recipe, config: type[Any], texts: Sequence[str]) -> tuple[A
 
 def _refuse_unread(config: Any, changes: Mapping[str, str]) -> None:
     """Refuses the user's settings of the algorithm that does not run."""
-    algorithm = getattr(config, "algorithm", None)
-    other = {"ppo": "sac", "sac": "ppo"}.get(algorithm or "")
+    if not isinstance(config, RunConfig):
+        return
+    idle = idle_algorithm(config.algorithm)
     for key, text in changes.items():
-        if other is not None and key.startswith(f"{other}."):
+        if key.startswith(f"{idle}."):
             raise UserError(
-                f"{text} has no effect with algorithm={algorithm}: leave it out, or set "
-                f"algorithm={other}."
+                f"{text} has no effect with algorithm={config.algorithm}: leave it out, or set "
+                f"algorithm={idle}."
             )
 
 

@@ -93,8 +93,25 @@ class TaskConfig:
             )
 
 
+class _Batches:
+    """What the settings of all algorithms share."""
+
+    num_envs: int
+    rollout: int
+
+    def whole_batches(self, steps: int) -> int:
+        """``steps``, rounded up to the end of a batch.
+
+        Examples:
+            >>> PPOConfig(num_envs=16, rollout=125).whole_batches(15_000)
+            16000
+        """
+        batch = self.num_envs * self.rollout
+        return -(-steps // batch) * batch
+
+
 @dataclass
-class PPOConfig:
+class PPOConfig(_Batches):
     """Proximal policy optimisation, as the paper's continuous control experiments set it."""
 
     num_envs: int = knob(16, "parallel environments", low=1)
@@ -117,16 +134,6 @@ class PPOConfig:
     checkpoint_every: int = knob(100_000, "environment steps between checkpoints", low=1)
     compile: bool = knob(False, f"{COMPILE}; of the acting policy as well")
 
-    def whole_batches(self, steps: int) -> int:
-        """``steps``, rounded up to the end of a batch.
-
-        Examples:
-            >>> PPOConfig(num_envs=16, rollout=125).whole_batches(15_000)
-            16000
-        """
-        batch = self.num_envs * self.rollout
-        return -(-steps // batch) * batch
-
     def check(self, prefix: str, run: object) -> None:
         """Refuses a minibatch that does not divide the batch."""
         batch = self.num_envs * self.rollout
@@ -139,7 +146,7 @@ class PPOConfig:
 
 
 @dataclass
-class SACConfig:
+class SACConfig(_Batches):
     """Soft actor-critic: off-policy, from a replay buffer that may begin with the demonstration."""
 
     num_envs: int = knob(8, "parallel environments", low=1)
@@ -187,15 +194,15 @@ class SACConfig:
     log_every: int = knob(1_000, "environment steps between rows of metrics", low=1)
     compile: bool = knob(False, f"{COMPILE}; of the acting policy as well")
 
-    def whole_batches(self, steps: int) -> int:
-        """``steps``, rounded up to the end of a batch.
 
-        Examples:
-            >>> SACConfig(num_envs=8, rollout=8).whole_batches(1_000)
-            1024
-        """
-        batch = self.num_envs * self.rollout
-        return -(-steps // batch) * batch
+def idle_algorithm(algorithm: object) -> str:
+    """The algorithm that does not run beside the chosen one: its settings are not read.
+
+    Examples:
+        >>> idle_algorithm("sac")
+        'ppo'
+    """
+    return "ppo" if algorithm == "sac" else "sac"
 
 
 @dataclass
@@ -315,6 +322,10 @@ class BCConfig:
             raise UserError(
                 f"algorithm={run.algorithm}: cloning is no reinforcement learning; leave it out."
             )
+        self.check_validation(prefix, run)
+
+    def check_validation(self, prefix: str, run: Any) -> None:
+        """Refuses early stopping without validation pairs."""
         if self.stop == "held_out" and run.demo.subsample == 1:
             raise UserError(
                 f"{prefix}stop=held_out needs transitions to hold out and demo.subsample=1 leaves "
@@ -408,7 +419,7 @@ class DemoRunConfig(RunConfig):
     @property
     def needs_actions(self) -> str | None:
         """What reads the demonstration's actions, and what to set if it has none; None: nothing."""
-        return self.reward_needs_actions or _replay_needs_actions(self)
+        return self.reward_needs_actions or replay_needs_actions(self)
 
     @property
     def reward_needs_actions(self) -> str | None:
@@ -429,7 +440,8 @@ def needs_actions(name: str, reward: object) -> str | None:
     return f"{name}.use_actions=true reads: set {name}.use_actions=false" if uses else None
 
 
-def _replay_needs_actions(run: RunConfig) -> str | None:
+def replay_needs_actions(run: RunConfig) -> str | None:
+    """The same of SAC's replay buffer; None where the demonstration is not put there."""
     chosen = run.sac.demonstration
     if run.algorithm != "sac" or chosen == "none":
         return None

@@ -94,7 +94,7 @@ def apply_task_defaults(config: Any, chosen: Collection[str] = ()) -> Any:
         (8, 125)
     """
     changes = task_defaults(config.task.env_id, chosen)
-    if config.task.demonstration is not None and not _chooses_demonstration(chosen):
+    if config.task.demonstration is not None and not any(map(chooses_demonstration, chosen)):
         changes["demo.path"] = config.task.demonstration
     for key, value in changes.items():
         *parts, name = key.split(".")
@@ -106,9 +106,12 @@ def apply_task_defaults(config: Any, chosen: Collection[str] = ()) -> Any:
     return config
 
 
-def _chooses_demonstration(chosen: Collection[str]) -> bool:
-    return any(
-        key.startswith("expert.")
-        or (key.startswith("demo.") and key not in ("demo.subsample", "demo.first"))
-        for key in chosen
-    )
+def chooses_demonstration(key: str) -> bool:
+    """Whether a setting says which demonstration it is, rather than how much of it is used.
+
+    Examples:
+        >>> chooses_demonstration("expert.seed"), chooses_demonstration("demo.first")
+        (True, False)
+    """
+    recorded = key.startswith("demo.") and key not in ("demo.subsample", "demo.first")
+    return recorded or key.startswith("expert.")

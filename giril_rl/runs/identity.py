@@ -20,7 +20,7 @@ from typing import Any
 
 from giril_rl.config.knobs import flat
 from giril_rl.config.recipes import Recipe
-from giril_rl.config.schema import EvalConfig, ExpertRunConfig
+from giril_rl.config.schema import EvalConfig, ExpertRunConfig, idle_algorithm
 from giril_rl.errors import UserError
 from giril_rl.files.disk import read_json
 
@@ -107,20 +107,20 @@ def config_hash(config: Any) -> str:
         >>> config_hash(RunConfig(seed=1)) == config_hash(RunConfig(seed=1, root="elsewhere"))
         True
     """
-    values = without_added({**RETIRED, **read(asdict(config))}, drop=NO_EFFECT)
+    values = without_added({**RETIRED, **without_idle(asdict(config))}, drop=NO_EFFECT)
     text = json.dumps([EDITION, values], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:12]
 
 
-def read(values: Mapping[str, Any]) -> dict[str, Any]:
+def without_idle(values: Mapping[str, Any]) -> dict[str, Any]:
     """Settings without those of the algorithm that does not run.
 
     Examples:
-        >>> read({"algorithm": "sac", "ppo": {"lr": 0.1}, "sac": {"lr": 0.2}})
+        >>> without_idle({"algorithm": "sac", "ppo": {"lr": 0.1}, "sac": {"lr": 0.2}})
         {'algorithm': 'sac', 'sac': {'lr': 0.2}}
     """
-    other = "ppo" if values.get("algorithm", "ppo") == "sac" else "sac"
-    return {name: value for name, value in values.items() if name != other}
+    idle = idle_algorithm(values.get("algorithm"))
+    return {name: value for name, value in values.items() if name != idle}
 
 
 def differences(
@@ -133,7 +133,9 @@ def differences(
         ['ppo.lr: 0.1 there, 0.2 now']
     """
     now = {**{key: before[key] for key in RETIRED if key in before}, **now}
-    old, new = (flat(without_added(read(config)), keep_empty=True) for config in (before, now))
+    old, new = (
+        flat(without_added(without_idle(config)), keep_empty=True) for config in (before, now)
+    )
     return [
         f"{key}: {old.get(key, 'nothing')!s} there, {new.get(key, 'nothing')!s} now"
         for key in [*new, *(key for key in old if key not in new)]

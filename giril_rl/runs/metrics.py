@@ -85,38 +85,34 @@ class MetricMeans:
 
     Means are weighted; a single batch's measurements stay as they are, bit for bit.
 
+    Args:
+        totals: names of those that are added up rather than averaged.
+
     Examples:
-        >>> means = MetricMeans()
-        >>> means.add({"loss": 1.0, "episodes": 1.0, "return": 5.0}, totals=["episodes"])
-        >>> means.add({"loss": 2.0, "episodes": 3.0, "return": 9.0}, totals=["episodes"],
-        ...           weights={"return": 3.0})
+        >>> means = MetricMeans(totals=["episodes"])
+        >>> means.add({"loss": 1.0, "episodes": 1.0, "return": 5.0})
+        >>> means.add({"loss": 2.0, "episodes": 3.0, "return": 9.0}, weights={"return": 3.0})
         >>> means.take()
         {'loss': 1.5, 'episodes': 4.0, 'return': 8.0}
         >>> means.take()
         {}
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *, totals: Collection[str] = ()) -> None:
+        self._totals = totals
         self._values: dict[str, list[list[float]]] = {}
-        self._totals: list[str] = []
 
     def add(
-        self,
-        values: Mapping[str, float],
-        *,
-        totals: Collection[str] = (),
-        weights: Mapping[str, float] | None = None,
+        self, values: Mapping[str, float], *, weights: Mapping[str, float] | None = None
     ) -> None:
         """Adds one batch's measurements.
 
         Args:
             values: by name.
-            totals: names of those that are added up rather than averaged.
             weights: of those that do not weigh 1.
         """
         for name, value in values.items():
             self._values.setdefault(name, []).append([value, (weights or {}).get(name, 1.0)])
-        self._totals = sorted({*self._totals, *totals})
 
     def take(self) -> dict[str, float]:
         """Totals and means of what was added since the last time."""
@@ -134,11 +130,11 @@ class MetricMeans:
 
     def state_dict(self) -> dict[str, Any]:
         """What was added and not taken yet."""
-        return {"values": self._values, "totals": self._totals}
+        return {"values": self._values}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restores what :meth:`state_dict` gave."""
-        self._values, self._totals = dict(state["values"]), list(state["totals"])
+        self._values = dict(state["values"])
 
 
 def _ends_a_line(path: Path) -> bool:

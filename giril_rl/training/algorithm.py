@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Protocol, cast
+from typing import Any, Protocol
 
 import torch
 from tensordict import TensorDictBase
 from torch import nn
 
-from giril_rl.config.schema import DemoRunConfig, RunConfig, ScalingConfig
+from giril_rl.config.schema import DemoConfig, RunConfig, replay_needs_actions
 from giril_rl.demos import Demonstration, subsample
 from giril_rl.envs import BatchedEnv
 from giril_rl.errors import UserError
@@ -18,9 +18,8 @@ from giril_rl.policies.making import make_agent, make_sac_agent
 from giril_rl.rewards.trajectory import fresh_episodes, trajectory_rewards
 from giril_rl.runs.randomness import Use
 from giril_rl.runs.run import Run
-from giril_rl.training.ppo import PPO
+from giril_rl.training.ppo import PPO, return_scaling
 from giril_rl.training.sac import SAC
-from giril_rl.transforms.scaling import ResetRule, ReturnScaling
 
 REPLAY = "replay"
 """The folder of a run that holds its replay buffer until training is over."""
@@ -113,7 +112,8 @@ def make_algorithm(
     known = None
     if demo is not None and cfg.sac.demonstration != "none":
         known = _demonstrated(demo, cfg, transform, moving, demonstration_reward)
-    scaling = getattr(cfg, "scaling", None)
+    settings = getattr(cfg, "scaling", None)
+    scaling = return_scaling(settings, cfg.sac.gamma) if settings is not None else []
     return SAC(
         make_sac_agent(env, cfg.sac, cfg.seed, use=use).to(cfg.device),
         cfg.sac,
@@ -123,7 +123,7 @@ def make_algorithm(
         demonstration=known,
         relabel=transform if moving else None,
         relabel_episodes=_of_whole_episodes(transform),
-        scaling=_scaling(scaling, cfg.sac.gamma) if isinstance(scaling, ScalingConfig) else None,
+        scaling=next(iter(scaling), None),
         termination=termination,
     )
 
@@ -135,25 +135,17 @@ def check_replay(cfg: RunConfig, demo: Demonstration) -> None:
         UserError: if it has no actions, or more transitions than ``sac.buffer_size``, once 1 in
             ``demo.subsample`` was kept.
     """
-    if cfg.algorithm != "sac" or cfg.sac.demonstration == "none":
+    needed = replay_needs_actions(cfg)
+    if needed is None:
         return
     if not demo.has_actions:
-        raise UserError(
-            f"the demonstration has no actions, which sac.demonstration={cfg.sac.demonstration} "
-            "puts into the replay: set sac.demonstration=none."
-        )
-    pairs = -(-len(demo) // _every(cfg))
+        raise UserError(f"the demonstration has no actions, which {needed}.")
+    pairs = pairs_of(cfg, demo)
     if pairs > cfg.sac.buffer_size:
         raise UserError(
             f"sac.buffer_size={cfg.sac.buffer_size} is less than the demonstration's {pairs:,} "
             "transitions: give the buffer more room, or set sac.demonstration=none."
         )
-
-
-def _scaling(cfg: ScalingConfig, gamma: float) -> ReturnScaling | None:
-    if not cfg.enabled:
-        return None
-    return ReturnScaling(gamma, reset=cast(ResetRule, cfg.reset), clip=cfg.clip)
 
 
 def _of_whole_episodes(transform: nn.Module | None) -> Callable[..., TensorDictBase] | None:
@@ -190,6 +182,11 @@ def _demonstrated(
     return subsample(Demonstration(known.cpu()), _every(cfg))
 
 
+def pairs_of(cfg: RunConfig, demo: Demonstration) -> int:
+    """The transitions that are learned from, once 1 in ``demo.subsample`` was kept."""
+    return -(-len(demo) // _every(cfg))
+
+
 def _every(cfg: RunConfig) -> int:
-    """1 in how many demonstrated transitions is kept."""
-    return cfg.demo.subsample if isinstance(cfg, DemoRunConfig) else 1
+    chosen = getattr(cfg, "demo", None)
+    return chosen.subsample if isinstance(chosen, DemoConfig) else 1

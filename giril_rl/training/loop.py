@@ -169,7 +169,7 @@ class _Session:
         self.trained.averaged = any(isinstance(part, BatchMeanReward) for part in parts)
         self.tracker = EpisodeTracker(self.algorithm.num_envs)
         self.finite = Finite(self.run.folder, self.algorithm.steps)
-        self.means = MetricMeans()
+        self.means = MetricMeans(totals=["train/episodes"])
 
     @property
     def is_over(self) -> bool:
@@ -210,7 +210,7 @@ class _Session:
             metrics["train/length_mean"] = lengths.double().mean().item()
             self.shown_return = f"{metrics['train/return_mean']:,.1f}"
         episodes = dict.fromkeys(("train/return_mean", "train/length_mean"), float(len(returns)))
-        self.means.add(metrics, totals=["train/episodes"], weights=episodes)
+        self.means.add(metrics, weights=episodes)
         every = self.algorithm.log_every
         if step // every > before // every or self.is_over:
             self.run.log(step, self.means.take(), phase=self.phase)

@@ -7,7 +7,6 @@ from typing import Any, cast
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
-from torchrl.envs import Transform
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
@@ -176,7 +175,7 @@ class PPO:
 
 def return_scaling(
     cfg: RewardRunConfig | ExpertRunConfig | ScalingConfig, gamma: float | None = None
-) -> list[Transform]:
+) -> list[ReturnScaling]:
     """The reward scaling of a run whose learner is PPO: a transform, or none.
 
     SAC scales the rewards that it draws from its replay buffer, so that nothing scales them before.

@@ -20,7 +20,6 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from giril_rl.config.schema import BCConfig, PPOConfig, TaskConfig, knob
 from giril_rl.envs import BatchedEnv, make_env
-from giril_rl.errors import UserError
 from giril_rl.policies import PPOAgent, make_agent
 from giril_rl.runs.checkpoint import refusing_misfits
 from giril_rl.runs.progress import progress
@@ -47,11 +46,7 @@ class CloneConfig(BCConfig):
 
     def check(self, prefix: str, run: Any) -> None:
         """Refuses early stopping without validation pairs."""
-        if self.stop == "held_out" and run.demo.subsample == 1:
-            raise UserError(
-                f"{prefix}stop=held_out needs transitions to hold out and demo.subsample=1 leaves "
-                f"none: set demo.subsample to at least 2, or {prefix}stop=fixed."
-            )
+        self.check_validation(prefix, run)
 
 
 @dataclass

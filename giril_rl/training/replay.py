@@ -109,10 +109,10 @@ class Replay:
             return None
         if self.share is None:
             known = len(self._demonstration)
-            return (torch.rand(count) < known / (known + len(self))).nonzero().squeeze(-1)
-        return (
-            (torch.arange(count) % minibatch < round(minibatch * self.share)).nonzero().squeeze(-1)
-        )
+            chosen = torch.rand(count) < known / (known + len(self))
+        else:
+            chosen = torch.arange(count) % minibatch < round(minibatch * self.share)
+        return chosen.nonzero().squeeze(-1)
 
     def _open(self, kinds: Sequence[tuple[torch.dtype, Sequence[int]]]) -> None:
         """Makes the columns, or finds those of a checkpoint; ``kinds`` has one row's entries."""

@@ -19,6 +19,7 @@ from giril_rl.runs.machine import processor
 from giril_rl.runs.metrics import METRICS, read_metrics
 from giril_rl.runs.pretrained import Pretrained
 from giril_rl.runs.run import Run
+from giril_rl.training.algorithm import pairs_of
 from giril_rl.training.baselines import HeldAction, RandomPolicy
 from giril_rl.training.loop import Trained
 from giril_rl.training.scoring import evaluate_both
@@ -102,7 +103,7 @@ def finish_run(
         "demo": None if demo is None else _source(cfg, demo),
         "demo_id": None if demo is None else demo.demo_id,
         "demo_transitions": None if demo is None else len(demo),
-        "demo_pairs": None if demo is None else _pairs(cfg, demo),
+        "demo_pairs": None if demo is None else pairs_of(cfg, demo),
         "config_hash": config_hash(cfg),
         "versions": run.versions,
         "processor": processor(),
@@ -194,9 +195,3 @@ def _seeds_of(demo: Demonstration | None) -> dict[str, int | None]:
     player = demo.card.get("expert")
     seed = player.get("seed") if isinstance(player, dict) else None
     return {"expert": seed, "demo": demo.card.get("seed")}
-
-
-def _pairs(cfg: RunConfig, demo: Demonstration) -> int:
-    """The transitions that were learned from, once 1 in ``demo.subsample`` was kept."""
-    chosen = getattr(cfg, "demo", None)
-    return -(-len(demo) // (chosen.subsample if isinstance(chosen, DemoConfig) else 1))

@@ -28,7 +28,7 @@ from giril_rl.transforms.scaling import ReturnScaling
 OBSERVATION, ACTION = "observation", "action"
 NEXT, ONWARD = ("next", "observation"), ("next", "following_observation")
 REWARD, TERMINATED = ("next", "reward"), ("next", "terminated")
-FLAGS = (("next", "done"), TERMINATED)
+DONE = ("next", "done")
 STORED: tuple[NestedKey, ...] = (OBSERVATION, ACTION, NEXT, TERMINATED, ONWARD)
 """What a minibatch has besides a stored reward; the last only where there are hidden resets."""
 
@@ -55,7 +55,7 @@ class SAC:
         termination: "ends" or "bootstrap", see :class:`~giril_rl.training.ppo.PPO`.
 
     Raises:
-        UserError: for another ``termination``, or a demonstration that the buffer cannot hold.
+        UserError: for another ``termination``.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -116,7 +116,7 @@ class SAC:
             loss = _loss(agent, cfg)
         self.loss = loss
         inputs: list[NestedKey] = [OBSERVATION, ACTION if agent.discrete else DRAWN]
-        self.keys = (*inputs, NEXT, REWARD, *FLAGS)
+        self.keys = (*inputs, NEXT, REWARD, DONE, TERMINATED)
         self.gradients = TracedGradients(
             loss, keys=self.keys, log=("alpha", "entropy"), compile=cfg.compile
         )
@@ -139,9 +139,7 @@ class SAC:
         if self.relabel_episodes is None:
             self._store(batch.flatten(0, 1))
         else:
-            kept = batch.select(
-                *(key for key in STORED if key in batch.keys(True)), ("next", "done")
-            )
+            kept = batch.select(*STORED, DONE, strict=False)
             for episode in self.held.add(kept):
                 self._store(self.relabel_episodes(_without_reward(episode)).squeeze(0))
         self.agent.update_normaliser(batch.get(OBSERVATION))
@@ -221,7 +219,7 @@ class SAC:
         """Networks, optimizer and counters, and what finds the replay buffer as it is now."""
         return {
             "agent": dict(self.agent.state_dict()),
-            "loss": dict(_tensors(self.loss)),
+            "loss": _tensors(self.loss),
             "optimizer": self.optimizer.state_dict(),
             "held": self.held.state_dict(),
             "replay": None if self.replay is None else self.replay.state_dict(),

@@ -12,7 +12,8 @@ from typing import Any, get_type_hints
 from giril_rl.config.compose import groups, resolved
 from giril_rl.config.knobs import flat
 from giril_rl.config.recipes import config_class, find, shipped
-from giril_rl.config.schema import AveragedRunConfig
+from giril_rl.config.schema import AveragedRunConfig, idle_algorithm
+from giril_rl.config.tasks import chooses_demonstration
 from giril_rl.errors import UserError
 from giril_rl.experiments.report.entries import PLAYER, TRUE_REWARD, entry, is_own
 from giril_rl.experiments.report.reading import RunRecord
@@ -110,8 +111,7 @@ def _usual(runs: Iterable[RunRecord]) -> dict[tuple[str, str], dict[str, Any]]:
 
 
 def _of_players(key: str) -> bool:
-    recorded = key.startswith("demo.") and key not in ("demo.path", "demo.subsample")
-    return recorded or key.startswith("expert.")
+    return key != "demo.path" and chooses_demonstration(key)
 
 
 def _reads(run: RunRecord, key: str) -> bool:
@@ -120,7 +120,7 @@ def _reads(run: RunRecord, key: str) -> bool:
         return run.method != TRUE_REWARD
     if key == "reward":
         return run.recipe != "control"
-    idle = "ppo." if run.config.get("algorithm") == "sac" else "sac."
+    idle = f"{idle_algorithm(run.config.get('algorithm'))}."
     return not key.startswith((idle, *_ignored(entry(run.method))))
 
 
