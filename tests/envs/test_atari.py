@@ -274,7 +274,7 @@ def test_games_are_seeded_now_and_then(monkeypatch):
     assert seeds == [first, None, third, None, fifth]
 
 
-@pytest.mark.parametrize("cap", [108_000, 160])
+@pytest.mark.parametrize("cap", [pytest.param(108_000, marks=pytest.mark.slow), 160])
 @pytest.mark.parametrize("episode", ["life", "game"])
 def test_a_restored_env_goes_on_as_the_first_would_have(episode, cap, monkeypatch):
     """With the lower cap many games begin, some of them seeded and some not."""

@@ -29,7 +29,7 @@ TINY = {
 IMITATION = {"demo.subsample": 2}
 FIT = {**IMITATION, "fit.steps": 4, "fit.batch": 4, "fit.log_every": 2}
 ADVERSARIAL = {**IMITATION, "reward.updates": 1, "reward.batch": 8}
-QUICK = ("giril", "bc", "control")
+QUICK = ("giril",)
 """The others are slow tests, and CI runs every recipe besides."""
 RECIPES = {
     "giril": FIT,

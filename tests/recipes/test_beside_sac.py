@@ -24,7 +24,7 @@ TINY = [
     "logger=null",
     "task.env_id=CartPole-v1",
 ]
-QUICK = ("gail", "sqil")
+QUICK = ("sqil",)
 """The others are slow tests, and CI runs every recipe besides."""
 RECIPES = {
     "gail": ["reward.hidden=[8]"],

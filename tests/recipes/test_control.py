@@ -20,6 +20,8 @@ REWARDS = [
     *("centred_giril", "random", "held_action"),
 ]
 UNTRAINED = ("random", "held_action")
+QUICK = ("constant", "negated_giril", *UNTRAINED)
+"""The others are slow tests, and CI runs every control besides."""
 TINY = [
     *("steps=256", "ppo.num_envs=2", "ppo.rollout=64", "ppo.minibatch=64", "ppo.epochs=1"),
     *("ppo.hidden=[16,16]", "ppo.checkpoint_every=128", "eval.episodes=2", "logger=null"),
@@ -81,7 +83,9 @@ def first_batch(folder):
     return rows[0]["ppo/reward_mean"]
 
 
-@pytest.mark.parametrize("reward", REWARDS)
+@pytest.mark.parametrize(
+    "reward", [r if r in QUICK else pytest.param(r, marks=pytest.mark.slow) for r in REWARDS]
+)
 def test_each_control_leaves_a_whole_result(reward, root, tmp_path):
     result = run("control", tmp_path / "run", root, f"reward={reward}")
     assert result.keys() >= RESULT
@@ -152,23 +156,26 @@ def test_a_continuous_action_cannot_be_held(tmp_path, capsys):
     assert not (tmp_path / "run").exists()
 
 
-@pytest.mark.parametrize("action", [2, -1, 0.5, None, True, "0"])
-def test_a_result_with_another_action_is_refused(action, root, tmp_path, capsys):
+def test_a_result_with_another_action_is_refused(root, tmp_path, capsys):
     run("control", tmp_path / "run", root, "reward=held_action")
     place = tmp_path / "run" / "result.json"
     result = json.loads(place.read_text())
-    place.write_text(json.dumps({**result, "held_action": action}))
-    assert main(["eval", str(tmp_path / "run")]) == 2
-    assert "action" in capsys.readouterr().err
+    for action in (2, -1, 0.5, None, True, "0"):
+        place.write_text(json.dumps({**result, "held_action": action}))
+        assert main(["eval", str(tmp_path / "run")]) == 2, action
+        assert "action" in capsys.readouterr().err, action
 
 
-@pytest.mark.parametrize(("control", "recipe"), [("giril", "giril"), ("icm", "cdil")])
+@pytest.mark.parametrize(
+    ("control", "recipe"), [pytest.param("giril", "giril", marks=pytest.mark.slow), ("icm", "cdil")]
+)
 def test_an_untrained_model_is_the_recipe_without_its_fit(control, recipe, root, tmp_path):
     run("control", tmp_path / "control", root, f"reward=untrained_{control}")
     run(recipe, tmp_path / "recipe", root, "fit.steps=0")
     assert weights(tmp_path / "control") == weights(tmp_path / "recipe")
 
 
+@pytest.mark.slow
 def test_negated_and_centred_are_made_of_the_recipe_s_own_reward(root, tmp_path):
     plain = ["scaling.enabled=false", "profile=paper"]
     run("giril", tmp_path / "giril", root, *plain)
@@ -198,11 +205,8 @@ def test_noise_is_averaged_over_environments_in_the_released_profile(root, tmp_p
     assert weights(tmp_path / "released") != weights(tmp_path / "paper")
 
 
-@pytest.mark.parametrize(
-    "words",
-    [["control", "reward=noise"], pytest.param(["cdil"], marks=pytest.mark.slow)],
-    ids=lambda w: w[0],
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("words", [["control", "reward=noise"], ["cdil"]], ids=lambda w: w[0])
 def test_a_run_that_died_ends_as_an_undisturbed_one(words, root, tmp_path, monkeypatch, capsys):
     recipe, *more = words
     run(recipe, tmp_path / "whole", root, *more)

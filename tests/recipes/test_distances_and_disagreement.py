@@ -26,7 +26,7 @@ LEARNERS = {
     ],
 }
 DRIL = ["fit.steps=20", "fit.log_every=10", "reward.hidden=[16]", "reward.bc_every=50"]
-QUICK = ("mmd", "dril")
+QUICK = ("mmd",)
 """The others are slow tests, and CI runs every recipe besides."""
 RECIPES = {
     "nearest": [],

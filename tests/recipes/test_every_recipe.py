@@ -122,7 +122,12 @@ def assert_whole(folder, result, recipe, task, steps):
     } <= {path.name for path in Path(folder).iterdir()}
 
 
-@pytest.mark.parametrize("recipe", EXTRA)
+QUICK = ("giril", "gail")  # A reward trained before the policy, and one beside it.
+
+
+@pytest.mark.parametrize(
+    "recipe", [r if r in QUICK else pytest.param(r, marks=pytest.mark.slow) for r in EXTRA]
+)
 def test_a_recipe_leaves_a_whole_result(recipe, root, tmp_path, capsys):
     result = run(recipe, tmp_path / "run", root)
     assert_whole(tmp_path / "run", result, recipe, "CartPole-v1", 4 * BATCH)
@@ -152,6 +157,7 @@ def test_a_recipe_leaves_a_whole_result(recipe, root, tmp_path, capsys):
     assert again["deterministic"] == result["deterministic"]
 
 
+@pytest.mark.slow
 def test_continuous_actions_with_pybullet(root, tmp_path, capfd):
     """The shipped task; the expert's folder and demonstration are given by their paths."""
     task = "task=inverted_pendulum"
@@ -196,11 +202,8 @@ def test_a_finished_command_does_not_train_again(root, tmp_path, monkeypatch, ca
     assert again.err == f"giril: {tmp_path} was finished earlier: nothing was run.\n"
 
 
-QUICK = ("giril", "gail")  # A reward trained before the policy, and one beside it.
-
-
 @pytest.mark.parametrize(
-    "recipe", [r if r in QUICK else pytest.param(r, marks=pytest.mark.slow) for r in EXTRA]
+    "recipe", [r if r == "giril" else pytest.param(r, marks=pytest.mark.slow) for r in EXTRA]
 )
 def test_a_run_follows_from_its_seed(recipe, root, tmp_path):
     results = {}
@@ -293,7 +296,10 @@ def test_a_refused_run_leaves_neither_its_folder_nor_its_experts(recipe, tmp_pat
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("recipe", ["giril", "gail", "control", "expert"])
+@pytest.mark.parametrize(
+    "recipe",
+    [*(pytest.param(r, marks=pytest.mark.slow) for r in ("giril", "gail", "expert")), "control"],
+)
 def test_no_simulator_is_left_open(recipe, root, tmp_path, monkeypatch):
     """Nor where every part is loaded from its checkpoint."""
     open_now: set[int] = set()

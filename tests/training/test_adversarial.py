@@ -209,7 +209,7 @@ def test_a_run_stopped_again_and_again_ends_bit_for_bit_as_an_undisturbed_one(
     assert len(rows(tmp_path / "run")) == 4
 
 
-@pytest.mark.parametrize("kind", ENVS)
+@pytest.mark.parametrize("kind", [pytest.param("discrete", marks=pytest.mark.slow), "box"])
 def test_neither_policy_nor_discriminator_sees_the_true_reward(kind, tmp_path):
     expected = train(tmp_path / "true", kind=kind)
     for garbage in ("noise", "nan"):

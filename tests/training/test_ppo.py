@@ -302,7 +302,13 @@ CASES = {
 }
 
 
-@pytest.mark.parametrize("case", [*CASES, pytest.param("compiled", marks=pytest.mark.slow)])
+QUICK = ("cartpole", "bullet, noisy reward")
+
+
+@pytest.mark.parametrize(
+    "case",
+    [c if c in QUICK else pytest.param(c, marks=pytest.mark.slow) for c in (*CASES, "compiled")],
+)
 def test_a_run_stopped_again_and_again_ends_bit_for_bit_as_an_undisturbed_one(case, tmp_path):
     settings = CASES.get(case, {"compile": True})
     _, expected = train(tmp_path / "whole", **settings)
@@ -368,7 +374,9 @@ def trained_on(kind, folder, relabel, env_id):
     return dict(agent.state_dict()), dict(transform.state_dict())
 
 
-@pytest.mark.parametrize("env_id", ["CartPole-v1", "Pendulum-v1"])
+@pytest.mark.parametrize(
+    "env_id", [pytest.param("CartPole-v1", marks=pytest.mark.slow), "Pendulum-v1"]
+)
 def test_the_learner_cannot_see_the_true_reward(env_id, tmp_path):
     expected = trained_on("true", tmp_path / "true", learned_reward, env_id)
     for kind in ("noise", "nan"):

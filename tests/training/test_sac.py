@@ -84,7 +84,7 @@ def train(folder, *, kind="box", garbage=None, moving=False, whole=False, known=
     ("kind", "settings"),
     [
         pytest.param("discrete", {}, marks=pytest.mark.slow),
-        ("box", {"moving": True}),
+        pytest.param("box", {"moving": True}, marks=pytest.mark.slow),
         ("box", {"whole": True}),
         pytest.param(
             *("box", {"entropy": "none", "normalise_observations": True}), marks=pytest.mark.slow
@@ -108,7 +108,7 @@ def test_a_run_stopped_again_and_again_ends_bit_for_bit_as_an_undisturbed_one(
     assert not (tmp_path / "run/replay").exists()
 
 
-@pytest.mark.parametrize("moving", [False, True])
+@pytest.mark.parametrize("moving", [False, pytest.param(True, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("kind", [pytest.param("discrete", marks=pytest.mark.slow), "box"])
 def test_the_learner_cannot_see_the_true_reward(kind, moving, tmp_path):
     settings = {"kind": kind, "moving": moving, "known": True}

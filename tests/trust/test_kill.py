@@ -56,6 +56,7 @@ def killed_at(nursery, recipe, root, expected, point):
     shutil.rmtree(root)
 
 
+@pytest.mark.slow
 def test_a_kill_anywhere(nursery, undisturbed, tmp_path):
     """The short form: some points of the whole chain, in one run that never gets far."""
     expected, points, _ = undisturbed("giril")
