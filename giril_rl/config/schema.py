@@ -192,7 +192,11 @@ class SACConfig(_Batches):
     )
     checkpoint_every: int = knob(20_000, "environment steps between checkpoints", low=1)
     log_every: int = knob(1_000, "environment steps between rows of metrics", low=1)
-    compile: bool = knob(False, f"{COMPILE}; of the acting policy as well")
+    compile: bool = knob(
+        False,
+        "torch.compile of whole gradient steps and of the acting policy: pays from some 20,000 "
+        "steps on; 10 to 40 seconds to begin",
+    )
 
 
 def idle_algorithm(algorithm: object) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -58,20 +59,18 @@ class TracedGradients:
         max_grad_norm: float | None = None,
         compile: bool = False,
     ) -> None:
-        self._loss = FunctionalLoss(loss) if FunctionalLoss.is_needed(loss) else _Holder(loss)
+        self.module = FunctionalLoss(loss) if FunctionalLoss.is_needed(loss) else _Holder(loss)
         self._keys = list(keys)
         self._log = list(log)
         self._max_grad_norm = max_grad_norm
-        trained = {k: p for k, p in self._loss.named_parameters() if p.requires_grad}
-        self._names = list(trained)
-        self.parameters = list(trained.values())
-        self._graph = ModuleGraph(
-            self._loss,
-            self._losses_and_gradients,
-            label=f"the gradient steps of {type(loss).__name__}",
-            recorded=compile or not convolves(loss),
-            compile=compile,
-        )
+        trained = {k: p for k, p in self.module.named_parameters() if p.requires_grad}
+        self.names, self.parameters = list(trained), list(trained.values())
+        self.graph_settings: dict[str, Any] = {
+            "label": f"the gradient steps of {type(loss).__name__}",
+            "recorded": compile or not convolves(loss),
+            "compile": compile,
+        }
+        self._graph = ModuleGraph(self.module, self.losses_and_gradients, **self.graph_settings)
 
     def __call__(self, batch: TensorDictBase) -> dict[str, Tensor]:
         """Replaces every parameter's ``.grad``.
@@ -84,25 +83,31 @@ class TracedGradients:
     def step(self, inputs: Sequence[Tensor]) -> dict[str, Tensor]:
         """The same for the entries of ``keys`` as plain tensors, in that order."""
         out = self._graph(inputs)
-        for name, parameter in zip(self._names, self.parameters, strict=True):
-            gradient = out.pop(name)
-            # A convolution's gradient may have channels last, but torch's fused Adam takes
-            # parameter and gradient to have the same memory layout.
-            same = gradient.stride() == parameter.stride()
-            parameter.grad = gradient if same else torch.empty_like(parameter).copy_(gradient)
+        for name, parameter in zip(self.names, self.parameters, strict=True):
+            parameter.grad = laid_out(out.pop(name), parameter)
         return out
 
-    def _losses_and_gradients(
+    def losses_and_gradients(
         self, state: dict[str, Tensor], inputs: Sequence[Tensor]
     ) -> dict[str, Tensor]:
+        """What :meth:`step` does, without a graph and without writing the gradients.
+
+        Args:
+            state: parameters of ``module`` by name, and buffers that stand in for its own. The
+                trained parameters are replaced by copies, and a buffer that the loss replaces.
+            inputs: the entries of ``keys``.
+
+        Returns:
+            Each trained parameter's gradient by the parameter's name, and the losses.
+        """
         with torch.enable_grad():
-            leaves = [state[name].detach().requires_grad_() for name in self._names]
-            state.update(zip(self._names, leaves, strict=True))
+            leaves = [state[name].detach().requires_grad_() for name in self.names]
+            state.update(zip(self.names, leaves, strict=True))
             sizes = {x.shape[:1] for x in inputs}
             batch = TensorDict(
                 dict(zip(self._keys, inputs, strict=True)), sizes.pop() if len(sizes) == 1 else ()
             )
-            out = torch.func.functional_call(self._loss, state, (batch,))
+            out = torch.func.functional_call(self.module, state, (batch,))
             losses = {k: v for k, v in out.items() if str(k).startswith("loss_")}
             gradients: Sequence[Tensor] = torch.autograd.grad(
                 [loss.sum() for loss in losses.values()],
@@ -115,10 +120,20 @@ class TracedGradients:
             factor = (self._max_grad_norm / (norm + 1e-6)).clamp(max=1.0)
             gradients = [gradient * factor for gradient in gradients]
         return {
-            **dict(zip(self._names, gradients, strict=True)),
+            **dict(zip(self.names, gradients, strict=True)),
             **{k: v.detach() for k, v in losses.items()},
             **{k: out.get(k).detach() for k in self._log},
         }
+
+
+def laid_out(gradient: Tensor, parameter: Tensor) -> Tensor:
+    """A gradient with its parameter's memory layout, which torch's fused Adam takes it to have.
+
+    A convolution's gradient may have channels last.
+    """
+    if gradient.stride() == parameter.stride():
+        return gradient
+    return torch.empty_like(parameter).copy_(gradient)
 
 
 class _Holder(nn.Module):

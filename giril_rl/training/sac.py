@@ -18,6 +18,7 @@ from torchrl.objectives.utils import ValueEstimators
 from giril_rl.config.schema import SACConfig
 from giril_rl.errors import UserError
 from giril_rl.graphs.gradients import TracedGradients
+from giril_rl.graphs.updates import CompiledUpdate
 from giril_rl.policies.agent import ActingPolicy, collecting
 from giril_rl.policies.soft_actor_critic import DRAWN, SACAgent
 from giril_rl.runs.randomness import seeded, stream_seed
@@ -122,6 +123,7 @@ class SAC:
         )
         self.optimizer = torch.optim.Adam(self.gradients.parameters, lr=cfg.lr, fused=True)
         self.targets = SoftUpdate(loss, tau=cfg.tau)
+        self._step = self._gradient_step()
 
     def act(self) -> TensorDictModuleBase:
         """The policy that collects: it samples, at first uniformly from all actions."""
@@ -170,11 +172,17 @@ class SAC:
             return None
         return self.replay.own(count)
 
-    def _step(self, minibatch: tuple[Tensor, ...]) -> dict[str, Tensor]:
-        log = self.gradients.step(minibatch)
-        self.optimizer.step()
-        self.targets.step()
-        return log
+    def _gradient_step(self) -> Callable[[Sequence[Tensor]], dict[str, Tensor]]:
+        if self.cfg.compile:
+            return CompiledUpdate(self.gradients, self.optimizer, self.targets).step
+
+        def step(minibatch: Sequence[Tensor]) -> dict[str, Tensor]:
+            log = self.gradients.step(minibatch)
+            self.optimizer.step()
+            self.targets.step()
+            return log
+
+        return step
 
     @torch.no_grad()
     def _minibatches(self, count: int) -> Any:
@@ -235,6 +243,7 @@ class SAC:
             for name, tensor in _tensors(self.loss).items():
                 tensor.copy_(state["loss"][name])
         self.optimizer.load_state_dict(state["optimizer"])
+        self._step = self._gradient_step()
         if self.scaling is not None:
             self.scaling.load_state_dict(state["scaling"])
         self.held.load_state_dict(state["held"])

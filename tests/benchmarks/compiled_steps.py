@@ -41,7 +41,7 @@ def main() -> None:
     torch.set_num_threads(args.threads)
     for name, size in SIZES.items():
         made, columns = CASES[name](size)
-        loss, keys = made._loss.loss.to(args.device), made._keys
+        loss, keys = made.module.loss.to(args.device), made._keys
         inputs = [column.to(args.device) for column in columns]
         plain = TracedGradients(loss, keys=keys)
         fast = TracedGradients(loss, keys=keys, compile=True)

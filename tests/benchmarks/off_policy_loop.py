@@ -1,9 +1,10 @@
 """Training speed of SAC with PWIL's reward on, paired with stable-baselines3's SAC.
 
 Both train in turns in one process: the same environments, actor and two critics of two hidden
-layers of 256, minibatches of 256, one gradient step for each environment step. Ours computes PWIL's
-reward besides and draws from a replay buffer with the demonstration in it; stable-baselines3 learns
-from the environment's own reward.
+layers, minibatches and gradient steps for each environment step. Ours computes PWIL's reward
+besides and draws from a replay buffer with the demonstration in it; stable-baselines3 learns from
+the environment's own reward. Every round begins a training of its own. What a training takes to
+begin, compiling above all, is measured by one of few steps and left out.
 
     pip install -e ".[benchmark]" && python tests/benchmarks/off_policy_loop.py
 """
@@ -31,6 +32,9 @@ from giril_rl.rewards.pwil import PWILConfig, pwil_reward
 from giril_rl.rewards.trajectory import fresh_episodes
 from giril_rl.training import SAC, Run, train_policy
 from giril_rl.transforms import IntrinsicReward
+
+BEGINNING = 192
+"""Steps after which all that is made once was made; the first 64 are random."""
 
 
 def ours(task: TaskConfig, cfg: SACConfig) -> Callable[[int], None]:
@@ -88,19 +92,33 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--steps", type=int, default=2_000, help="environment steps a round")
     parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--hidden", type=int, default=256, help="units of each of two layers")
+    parser.add_argument("--batch", type=int, default=256, help="transitions a minibatch")
+    parser.add_argument("--updates", type=float, default=1.0, help="gradient steps a step")
+    parser.add_argument("--compile", action="store_true", help="giril_rl's sac.compile=true")
     args = parser.parse_args()
     warnings.simplefilter("ignore")
     torch.set_num_threads(args.threads)
-    cfg = SACConfig(hidden=[256, 256], batch=256, updates=1.0, random_steps=64, lr=3e-4)
+    cfg = SACConfig(
+        hidden=[args.hidden] * 2,
+        batch=args.batch,
+        updates=args.updates,
+        random_steps=64,
+        lr=3e-4,
+        compile=args.compile,
+    )
     task = TaskConfig(name="task", env_id=args.env_id)
     pair = {"giril_rl": ours(task, cfg), "stable-baselines3": theirs(task, cfg)}
     ratios = []
     for number in range(args.rounds + 1):
         speed = {}
         for name, train in pair.items():
-            began = time.perf_counter()
-            train(args.steps)
-            speed[name] = args.steps / (time.perf_counter() - began)
+            seconds = []
+            for steps in (BEGINNING, BEGINNING + args.steps):
+                began = time.perf_counter()
+                train(steps)
+                seconds.append(time.perf_counter() - began)
+            speed[name] = args.steps / (seconds[1] - seconds[0])
         if number == 0:
             continue  # Warming up.
         ratios.append(speed["giril_rl"] / speed["stable-baselines3"])

@@ -119,7 +119,7 @@ def test_every_loss_on_frames(name, monkeypatch):
     monkeypatch.setattr(torch, "randn_like", lambda x: torch.full_like(x, 0.3))
     monkeypatch.setattr(torch, "rand", lambda *shape, device: torch.full(shape, 0.3, device=device))
     gradients, inputs = CASES[name](8)
-    losses = [gradients._loss.loss, copy.deepcopy(gradients._loss.loss)]
+    losses = [gradients.module.loss, copy.deepcopy(gradients.module.loss)]
     made, plain = (
         TracedGradients(loss, keys=gradients._keys, compile=compile)
         for loss, compile in zip(losses, (True, False), strict=True)

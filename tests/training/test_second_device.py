@@ -148,7 +148,7 @@ def test_a_step_of_ppo(kind):
     scalars = ("advantage", "value_target", "state_value")
     rows |= {"action_log_prob": torch.randn(8), **{k: torch.randn(8, 1) for k in scalars}}
     with second_device() as device:
-        loss = device.take(learner.gradients._loss.loss)
+        loss = device.take(learner.gradients.module.loss)
         gradients = Eager(loss, keys=learner.keys, log=("kl_approx",), max_grad_norm=0.5)
         logs = gradients.step([device.tensor(rows[key]) for key in learner.keys])
         torch.optim.Adam(gradients.parameters).step()
@@ -175,7 +175,7 @@ def test_acting_relabelling_and_learning(kind, termination, monkeypatch):
     for name in ("done", "terminated", "truncated"):
         batch["next", name] = ended.clone()
     with second_device(values=True) as device:
-        loss = learner.gradients._loss.loss
+        loss = learner.gradients.module.loss
         for module in (agent, relabel, learner.advantage, loss):
             device.take(module)
         learner.gradients = Eager(
