@@ -64,7 +64,9 @@ def demonstration_folder(path: Path | str, task: TaskConfig | None = None, seed:
     name, slash, index = str(path).partition(":")[2].partition("/")
     found = shipped_demonstrations()
     if not name and task is not None:
-        ids = {read_json(places[0] / "card.json").get("env_id"): n for n, places in found.items()}
+        # `half_cheetah` goes before `half_cheetah-novice`, of the same environment.
+        names = reversed(found.items())
+        ids = {read_json(places[0] / "card.json").get("env_id"): n for n, places in names}
         name = ids.get(task.env_id, task.name)
     if name not in found:
         hint = did_you_mean(name, found) or f": there are {', '.join(found)}."

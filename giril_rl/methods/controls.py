@@ -56,8 +56,13 @@ class ControlRunConfig(AveragedRunConfig):
 
     @property
     def needs_demonstration(self) -> bool:
-        """Whether the control is made of a demonstration, and so of an expert."""
-        return self.method.demonstration
+        """Whether the control is made of a demonstration, or its learner is given one.
+
+        A control gets all that a method gets but the reward: with SAC, the demonstration in the
+        replay buffer too.
+        """
+        replayed = self.algorithm == "sac" and self.sac.demonstration != "none"
+        return self.method.demonstration or (replayed and self.trains)
 
     @property
     def reward_needs_actions(self) -> str | None:

@@ -2,7 +2,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from giril_rl.config.schema import DemoConfig, FitConfig, TaskConfig
+from giril_rl.config.schema import DemoConfig, FitConfig, SACConfig, TaskConfig
 from giril_rl.demos import Demonstration
 from giril_rl.envs import make_env
 from giril_rl.methods import ControlRunConfig
@@ -72,6 +72,14 @@ def test_a_constant_needs_no_demonstration(env, tmp_path):
     assert isinstance(reward, ConstantReward) and reward.value == 1 and seeds == {}
     needed = {r for r in ("constant", "copy", "noise", "random") if config(r).needs_demonstration}
     assert needed == {"copy", "noise"}
+
+
+def test_in_the_replay_buffer_a_control_has_the_demonstration_that_a_method_has():
+    kinds = ("constant", "copy", "entropy_bonus", "random")
+    off_policy = {r for r in kinds if config(r, algorithm="sac").needs_demonstration}
+    assert off_policy == {"constant", "copy", "entropy_bonus"}
+    without = SACConfig(demonstration="none")
+    assert not config("constant", algorithm="sac", sac=without).needs_demonstration
 
 
 @pytest.mark.parametrize(
