@@ -14,7 +14,7 @@ from giril_rl.envs import as_recorded_task, gym_factory
 from giril_rl.errors import UserError
 from giril_rl.training import check_inputs, obtain_demonstration
 
-PENDULUMS = ("inverted_double_pendulum", "inverted_pendulum")
+PENDULUMS = ("inverted_double_pendulum", "inverted_pendulum", "inverted_pendulum_swingup")
 SHIPPED = shipped_demonstrations()
 each = pytest.mark.parametrize("name", SHIPPED)
 game = pytest.mark.parametrize("name", [name for name in SHIPPED if name not in PENDULUMS])
@@ -69,7 +69,7 @@ def test_a_recipe_finds_it_by_its_task(name, tmp_path):
     assert not any(tmp_path.iterdir())
 
 
-def test_all_six_games_have_one_and_both_pendulums_five():
+def test_all_six_games_have_one_and_each_pendulum_five():
     games = {"space_invaders", "beam_rider", "breakout", "qbert", "seaquest", "kung_fu_master"}
     counts = {name: len(folders) for name, folders in SHIPPED.items()}
     assert counts == dict.fromkeys(games, 1) | dict.fromkeys(PENDULUMS, 5)
@@ -84,6 +84,16 @@ def test_the_runs_seed_chooses_and_they_are_taken_in_turn():
     assert demonstration_name("shipped", task, 12) == "shipped:inverted_pendulum/2"
     with pytest.raises(UserError, match=r"no such demonstration of inverted_pendulum: choose 0 to"):
         demonstration_folder("shipped:inverted_pendulum/5")
+
+
+def test_a_task_goes_before_another_set_of_its_environment(tmp_path, monkeypatch):
+    for name in ("walker", "walker-novice"):
+        (tmp_path / name / "0").mkdir(parents=True)
+        (tmp_path / name / "0" / "card.json").write_text('{"env_id": "Walker-v0"}')
+    monkeypatch.setattr("giril_rl.demos.shipped._FOLDER", tmp_path)
+    task = TaskConfig(name="mine", env_id="Walker-v0")
+    assert demonstration_name("shipped", task) == "shipped:walker/0"
+    assert demonstration_name("shipped:walker-novice", task) == "shipped:walker-novice/0"
 
 
 def test_there_is_no_other_one():
