@@ -21,7 +21,7 @@ from giril_rl.rewards import GenerativeReward
 from giril_rl.rewards import fit as whole_fit
 
 BALL = Path(__file__).parents[1] / "docs/tutorials/giril_on_your_environment.py"
-GENERATED = {"docs/results/pybullet/report.md"}
+GENERATED = {"docs/results/pybullet/report.md", "docs/results/pybullet-sac/report.md"}
 CARTPOLE = TaskConfig(name="cartpole", env_id="CartPole-v1")
 PENDULUM = TaskConfig(name="pendulum", env_id="Pendulum-v1")
 
@@ -169,6 +169,7 @@ OF = {
     "docs/reproduce.md": (study_of("games.yaml"), nothing),
     "docs/results/pybullet.md": (runs, nothing),
     "docs/results/pybullet-0.1.md": (runs, nothing),
+    "docs/results/pybullet-sac.md": (runs, nothing),
     "docs/results/atari.md": (runs, nothing),
     "docs/results/no-survival.md": (runs, nothing),
     "docs/results/ablations.md": (runs, nothing),
