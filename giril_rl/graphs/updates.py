@@ -33,20 +33,15 @@ class CompiledUpdate:
         targets: TorchRL's update of the loss's target networks; None for a loss without.
 
     Examples:
-        >>> from tensordict import TensorDict
-        >>> class Square(nn.Module):
-        ...     def __init__(self):
-        ...         super().__init__()
-        ...         self.weight = nn.Parameter(torch.tensor(3.0))
-        ...     def forward(self, td):
-        ...         return TensorDict({"loss_square": (self.weight * td["x"]).square().mean()})
-        >>> module = Square()
-        >>> gradients = TracedGradients(module, keys=["x"], compile=True)
-        >>> update = CompiledUpdate(gradients, Adam(gradients.parameters, lr=0.5))
-        >>> update.step([torch.ones(4)])["loss_square"]  # doctest: +SKIP
-        tensor(9.)
-        >>> module.weight.item()  # doctest: +SKIP
-        2.5
+        >>> from torchrl.modules import QValueActor
+        >>> from torchrl.objectives import DQNLoss
+        >>> network = QValueActor(nn.Linear(2, 3), in_keys=["observation"], action_space="one_hot")
+        >>> loss = DQNLoss(network, action_space="one_hot", delay_value=True)
+        >>> after = [("next", name) for name in ("observation", "reward", "done", "terminated")]
+        >>> gradients = TracedGradients(loss, keys=["observation", "action", *after], compile=True)
+        >>> optimizer = Adam(gradients.parameters, lr=1e-3)
+        >>> update = CompiledUpdate(gradients, optimizer, SoftUpdate(loss, tau=0.005))
+        >>> losses = update.step(minibatch)  # doctest: +SKIP
     """
 
     def __init__(

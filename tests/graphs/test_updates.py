@@ -13,7 +13,7 @@ from torchrl.objectives import SoftUpdate
 from giril_rl.config.schema import SACConfig
 from giril_rl.graphs import CompiledUpdate, TracedGradients
 from giril_rl.policies.soft_actor_critic import DRAWN, SACAgent
-from giril_rl.training.sac import _loss
+from giril_rl.training.sac import _loss, _tensors
 
 SPECS = {"box": Bounded(-1, 1, shape=(2,)), "discrete": Categorical(3)}
 
@@ -39,8 +39,7 @@ class Learner:
         return log
 
     def state(self):
-        of_loss = {**dict(self.loss.named_parameters()), **dict(self.loss.named_buffers())}
-        kept = {name: tensor.detach().clone() for name, tensor in of_loss.items()}
+        kept = {name: tensor.detach().clone() for name, tensor in _tensors(self.loss).items()}
         return kept, copy.deepcopy(self.optimizer.state_dict()["state"])
 
 
@@ -79,10 +78,8 @@ def test_a_saved_optimizer_goes_on(as_it_is):
     for number in range(3):
         other.plainly(inputs_of(one.agent, number))
     with torch.no_grad():
-        for name, tensor in other.state()[0].items():
-            {**dict(one.loss.named_parameters()), **dict(one.loss.named_buffers())}[name].copy_(
-                tensor
-            )
+        for name, tensor in _tensors(one.loss).items():
+            tensor.copy_(_tensors(other.loss)[name])
     one.optimizer.load_state_dict(copy.deepcopy(other.optimizer.state_dict()))
     update = CompiledUpdate(one.gradients, one.optimizer, one.targets)
     for number in range(3, 5):
