@@ -243,7 +243,7 @@ def test_the_demonstrations_time_begins_with_each_episode_and_counts_what_was_le
 
 def test_a_time_aware_critic_needs_a_time_limit():
     cfg = replace(CFG, time_aware_critic=True)
-    with pytest.raises(UserError, match="sac.time_aware_critic=true: the environment has no time"):
+    with pytest.raises(UserError, match="true: the environment has no time limit"):
         SAC(SACAgent(3, Bounded(-1, 1, shape=(1,)), hidden=[8]), cfg, steps=STEPS)
 
 

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 from giril_rl.experiments.report.entries import PLAYER
 from giril_rl.experiments.report.rows import Panel, Row
+from giril_rl.experiments.report.settings import Changes
 from giril_rl.experiments.report.text import markdown, seeds_text, with_interval
 
 ALGORITHMS = ("ppo", "sac")
@@ -14,15 +16,17 @@ FEWEST = 2
 
 
 def twins(panel: Panel) -> dict[int, list[dict[str, Row]]]:
-    """The main rows that both algorithms have, by budget: for each method ``{algorithm: row}``.
+    """The rows that both algorithms have, by budget: for each method ``{algorithm: row}``.
 
-    Controls are left out, and budgets at which fewer than two methods imitate with both.
+    Settings other than the algorithm's own are the same for both. Controls are left out, and
+    budgets at which fewer than two methods imitate with both.
     """
-    found: dict[int, dict[tuple[str, str | None], dict[str, Row]]] = {}
-    for row in panel.main:
+    found: dict[int, dict[tuple[Any, ...], dict[str, Row]]] = {}
+    for row in panel.rows:
         if row.algorithm in ALGORITHMS and not row.is_control and row.method != PLAYER:
             kinds = found.setdefault(row.steps, {})
-            kinds.setdefault((row.method, row.profile), {})[str(row.algorithm)] = row
+            key = (row.method, row.profile, _changes(row))
+            kinds.setdefault(key, {}).setdefault(str(row.algorithm), row)
     both = {
         steps: [pair for pair in kinds.values() if len(pair) == len(ALGORITHMS)]
         for steps, kinds in sorted(found.items())
@@ -32,6 +36,11 @@ def twins(panel: Panel) -> dict[int, list[dict[str, Row]]]:
         for steps, pairs in both.items()
         if len({row.method for pair in pairs for row in pair.values() if row.is_learned}) >= FEWEST
     }
+
+
+def _changes(row: Row) -> Changes:
+    """A row's changes without those of its algorithm."""
+    return tuple(change for change in row.changes if not change[0].startswith(f"{row.algorithm}."))
 
 
 def learner_and_reward(panel: Panel) -> str:
@@ -47,10 +56,13 @@ def _table(panel: Panel, steps: int, pairs: list[dict[str, Row]]) -> str:
     learned = [row for pair in pairs for row in pair.values() if row.is_learned]
     best = max(round(row.estimates[0].value, 1) for row in learned)
     lines = [
-        {"reward": pair["ppo"].name_of_both} | {key: _cell(row, best) for key, row in pair.items()}
+        {"reward": _name(pair)} | {key: _cell(row, best) for key, row in pair.items()}
         for pair in pairs
     ]
-    lines.append({"reward": "best control", **{key: _control(controls[key]) for key in ALGORITHMS}})
+    if any(controls.values()):
+        lines.append(
+            {"reward": "best control"} | {key: _control(controls[key]) for key in controls}
+        )
     rows = [row for pair in pairs for row in pair.values()]
     rows += [row for row in controls.values() if row is not None]
     text = (
@@ -59,6 +71,11 @@ def _table(panel: Panel, steps: int, pairs: list[dict[str, Row]]) -> str:
         "columns to see what the learner does.\n"
     )
     return f"{text}\n{markdown([_titled(line) for line in lines])}"
+
+
+def _name(pair: Mapping[str, Row]) -> str:
+    changes = [f"{key}={value}" for key, value in _changes(pair["ppo"])]
+    return ", ".join([pair["ppo"].name_of_both, *changes])
 
 
 def _titled(line: Mapping[str, str]) -> dict[str, str]:

@@ -40,23 +40,23 @@ def write_report(folder: Path, out: Path) -> str:
     check_place(out, "--out")
     runs, unfinished = read_runs(folder)
     panels = panels_of(runs)
-    tables = [table for panel in panels for table in tables_of(panel)]
+    tables = [tables_of(panel) for panel in panels]
+    flat = [table for of_panel in tables for table in of_panel]
     out.mkdir(parents=True, exist_ok=True)
     sections = [_head(runs, unfinished)]
     if draw_bars(panels, out / "normalised.png"):
         sections.append("## All tasks\n\n![normalised scores](normalised.png)\n")
         sections.append(overall(panels))
-    for table in tables:
-        sections.append(_section(table, out))
-        if table.name == "results":
-            sections.append(learner_and_reward(table.panel))
+    for panel, of_panel in zip(panels, tables, strict=True):
+        sections += [_section(table, out) for table in of_panel]
+        sections.append(learner_and_reward(panel))
     sections += draw_pictures(panels, out)
     sections += [_repeats(panels), _without_result(unfinished)]
     write_atomically(out / "report.md", "\n".join(text for text in sections if text))
-    write_atomically(out / "results.csv", results_csv(tables))
+    write_atomically(out / "results.csv", results_csv(flat))
     write_atomically(out / "runs.csv", _runs_csv(unfinished, panels))
     missing = f", {len(unfinished)} without a result" if unfinished else ""
-    return f"{len(runs)} finished runs in {len(tables)} tables{missing}: {out / 'report.md'}"
+    return f"{len(runs)} finished runs in {len(flat)} tables{missing}: {out / 'report.md'}"
 
 
 def _head(runs: Sequence[RunRecord], unfinished: Sequence[Unfinished]) -> str:

@@ -262,6 +262,24 @@ def test_learner_and_reward(made, capsys):
     ]
 
 
+def test_learner_and_reward_with_settings_that_differ_from_the_recipes_own(made):
+    """Each beside its own twin; settings of one algorithm have none in the other."""
+    for algorithm, own, pwil, giril in (
+        (PPO, "ppo.lr=0.002", -990.0, 20.0),
+        (SAC, "sac.time_aware_critic=true", 700.0, 30.0),
+    ):
+        made("pwil", algorithm, own, score=pwil)
+        made("giril", algorithm, PAPER, "demo.subsample=1", score=giril)
+        made("giril", algorithm, PAPER, f"demo.subsample={3 if algorithm == SAC else 2}", score=0.0)
+    made("bc", "demo.subsample=2", score=1.0)
+    assert learner_and_reward(panel(made)).splitlines()[-4:] == [
+        "| reward | PPO | SAC |",
+        "| --- | --- | --- |",
+        "| GIRIL (paper), demo.subsample=1 | 20.0 | 30.0 |",
+        "| PWIL | -990.0 | **700.0** |",
+    ]
+
+
 def test_one_method_with_both_algorithms_makes_no_table_of_learners(made):
     for algorithm in (PPO, SAC):
         made("pwil", algorithm, score=1.0)
