@@ -197,6 +197,12 @@ class SACConfig(_Batches):
     )
     checkpoint_every: int = knob(20_000, "environment steps between checkpoints", low=1)
     log_every: int = knob(1_000, "environment steps between rows of metrics", low=1)
+    precision: str = knob(
+        "fp32",
+        "bf16: products between hidden layers are of bfloat16 numbers: pays for layers of 256 on "
+        "processors that have them",
+        choices=("fp32", "bf16"),
+    )
     compile: bool = knob(
         False,
         "torch.compile of whole gradient steps and of the acting policy: pays from some 20,000 "

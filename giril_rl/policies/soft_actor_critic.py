@@ -14,6 +14,7 @@ from torchrl.modules.distributions import OneHotCategorical
 from giril_rl.errors import UserError
 from giril_rl.networks.action_bounds import ActionBounds, single_action_spec
 from giril_rl.networks.normalise import RunningNormaliser
+from giril_rl.networks.precision import Precision, layers_of
 from giril_rl.policies.agent import Agent
 from giril_rl.runs.pretrained import remembered
 
@@ -39,6 +40,8 @@ class SACAgent(Agent):
         hidden: hidden layers of actor and critics.
         normalise: whether observations are normalised with running statistics.
         noise: standard deviation before squashing; None lets the network choose it for each state.
+        precision: "fp32", or "bf16" for products in bfloat16 between hidden layers, see
+            :func:`giril_rl.networks.precision.layers_of`.
 
     Raises:
         UserError: for an action spec of another kind.
@@ -64,6 +67,7 @@ class SACAgent(Agent):
         hidden: Sequence[int] = (128, 128),
         normalise: bool = False,
         noise: float | None = None,
+        precision: Precision = "fp32",
     ) -> None:
         super().__init__()
         spec = check_squashable(action_spec)
@@ -71,6 +75,7 @@ class SACAgent(Agent):
         self.discrete = isinstance(spec, (Categorical, OneHot))
         self.bounds = ActionBounds.of(spec)
         self.observation_size, self.hidden = observation_size, list(hidden)
+        self.precision: Precision = precision
         self.action_size = int(spec.space.n if self.discrete else spec.shape[-1])
         self.normaliser = RunningNormaliser(observation_size) if normalise else nn.Identity()
         head: list[nn.Module] = []
@@ -81,7 +86,13 @@ class SACAgent(Agent):
         self.actor = nn.Sequential(self._mlp(observation_size, outputs), *head)
 
     def _mlp(self, inputs: int, outputs: int) -> MLP:
-        return MLP(inputs, outputs, num_cells=self.hidden, activation_class=nn.ReLU)
+        return MLP(
+            inputs,
+            outputs,
+            num_cells=self.hidden,
+            activation_class=nn.ReLU,
+            layer_class=layers_of(len(self.hidden) + 1, self.precision),
+        )
 
     def normalised(self, observation: Tensor) -> Tensor:
         """Raw observations ``(*batch, observation_size)`` as actor and critics see them."""

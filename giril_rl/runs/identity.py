@@ -53,6 +53,7 @@ ADDED = {
     "held_episodes": 20,
     "demo.first": None,
     "sac.time_aware_critic": False,
+    "sac.precision": "fp32",
     **dict.fromkeys(("reward.use_actions", "giril.use_actions", "icm.use_actions"), True),
 }
 """Keys that earlier versions did not have, with the value that they behaved by."""

@@ -96,6 +96,7 @@ def main() -> None:
     parser.add_argument("--batch", type=int, default=256, help="transitions a minibatch")
     parser.add_argument("--updates", type=float, default=1.0, help="gradient steps a step")
     parser.add_argument("--compile", action="store_true", help="giril_rl's sac.compile=true")
+    parser.add_argument("--precision", default="fp32", help="giril_rl's sac.precision")
     args = parser.parse_args()
     warnings.simplefilter("ignore")
     torch.set_num_threads(args.threads)
@@ -106,6 +107,7 @@ def main() -> None:
         random_steps=64,
         lr=3e-4,
         compile=args.compile,
+        precision=args.precision,
     )
     task = TaskConfig(name="task", env_id=args.env_id)
     pair = {"giril_rl": ours(task, cfg), "stable-baselines3": theirs(task, cfg)}

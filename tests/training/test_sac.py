@@ -92,6 +92,7 @@ def train(folder, *, kind="box", garbage=None, moving=False, whole=False, known=
         pytest.param("box", {"moving": True}, marks=pytest.mark.slow),
         ("box", {"whole": True, "time_aware_critic": True}),
         pytest.param("discrete", {"time_aware_critic": True}, marks=pytest.mark.slow),
+        pytest.param("box", {"precision": "bf16"}, marks=pytest.mark.slow),
         pytest.param(
             *("box", {"entropy": "none", "normalise_observations": True}), marks=pytest.mark.slow
         ),
