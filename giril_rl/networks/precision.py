@@ -49,7 +49,7 @@ def layers_of(count: int, precision: Precision) -> Callable[..., nn.Linear]:
     between = repeat(BFloat16Linear if precision == "bf16" else nn.Linear, count - 2)
     kinds: Iterator[type[nn.Linear]] = chain([nn.Linear], between, [nn.Linear])
 
-    def make(*sizes: int, **settings: Any) -> nn.Linear:
-        return next(kinds)(*sizes, **settings)
+    def make(in_features: int, out_features: int, **settings: Any) -> nn.Linear:
+        return next(kinds)(in_features, out_features, **settings)
 
     return make
