@@ -182,11 +182,6 @@ class SACConfig(_Batches):
         low=0,
         low_open=True,
     )
-    time_aware_critic: bool = knob(
-        False,
-        "the critics also see how much of the time limit is over, the actor does not: for rewards "
-        "that depend on what the episode visited before, such as PWIL's",
-    )
     random_steps: int = knob(1_000, "environment steps of random actions before learning", low=0)
     buffer_size: int = knob(1_000_000, "transitions in the replay buffer, on disk", low=1)
     demonstration: str = knob(

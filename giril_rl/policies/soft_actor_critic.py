@@ -20,8 +20,6 @@ from giril_rl.runs.pretrained import remembered
 
 DRAWN = "drawn_action"
 """An action in units in which the bounds are -1 and 1; critics and losses see these."""
-ELAPSED = "elapsed"
-"""The share of the time limit that is over."""
 _EDGE = 1 - 1e-6
 """Largest squashed action whose log-density is finite in float32."""
 
@@ -186,21 +184,14 @@ class SACAgent(Agent):
             return_log_prob=True,
         )
 
-    def critic(self, *, time_aware: bool = False) -> TensorDictModule:
-        """A new critic: of observation and drawn action, or of every discrete action.
-
-        Args:
-            time_aware: whether it also reads :data:`ELAPSED`, the time limit's share ``(*batch,
-                1)`` that is over.
-        """
-        seen = ["observation", *([ELAPSED] if time_aware else [])]
-        size = self.observation_size + time_aware
+    def critic(self) -> TensorDictModule:
+        """A new critic: of observation and drawn action, or of every discrete action."""
         if self.discrete:
-            network = self._mlp(size, self.action_size)
-            return TensorDictModule(network, in_keys=seen, out_keys=["action_value"])
+            network = self._mlp(self.observation_size, self.action_size)
+            return TensorDictModule(network, in_keys=["observation"], out_keys=["action_value"])
         return TensorDictModule(
-            self._mlp(size + self.action_size, 1),
-            in_keys=[*seen, DRAWN],
+            self._mlp(self.observation_size + self.action_size, 1),
+            in_keys=["observation", DRAWN],
             out_keys=["state_action_value"],
         )
 

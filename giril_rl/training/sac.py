@@ -20,9 +20,9 @@ from giril_rl.errors import UserError
 from giril_rl.graphs.gradients import TracedGradients
 from giril_rl.graphs.updates import CompiledUpdate
 from giril_rl.policies.agent import ActingPolicy, collecting
-from giril_rl.policies.soft_actor_critic import DRAWN, ELAPSED, SACAgent
+from giril_rl.policies.soft_actor_critic import DRAWN, SACAgent
 from giril_rl.runs.randomness import seeded, stream_seed
-from giril_rl.training.episodes import EpisodeClock, HeldEpisodes
+from giril_rl.training.episodes import HeldEpisodes
 from giril_rl.training.replay import Replay
 from giril_rl.transforms.scaling import ReturnScaling
 
@@ -30,9 +30,8 @@ OBSERVATION, ACTION = "observation", "action"
 NEXT, ONWARD = ("next", "observation"), ("next", "following_observation")
 REWARD, TERMINATED = ("next", "reward"), ("next", "terminated")
 DONE = ("next", "done")
-STORED: tuple[NestedKey, ...] = (OBSERVATION, ACTION, NEXT, TERMINATED, ONWARD, ELAPSED)
-"""What a minibatch has besides a stored reward; the last two only where there are hidden resets and
-where critics see the time."""
+STORED: tuple[NestedKey, ...] = (OBSERVATION, ACTION, NEXT, TERMINATED, ONWARD)
+"""What a minibatch has besides a stored reward; the last only where there are hidden resets."""
 
 
 class SAC:
@@ -49,17 +48,15 @@ class SAC:
         seed: seed of the critics' weights.
         folder: where the replay buffer's files are; None keeps it in memory.
         demonstration: flat transitions with a reward, for ``cfg.demonstration``; None for none.
-            With ``"elapsed"`` for critics that see the time.
         relabel: a transform that writes the reward into a flat minibatch; None takes the stored.
         relabel_episodes: writes the reward into whole episodes ``(1, length)``, which are stored
             once they have ended; None stores each batch.
         scaling: divides rewards by its running standard deviation as they are drawn; it learns from
             each batch. None does not scale.
         termination: "ends" or "bootstrap", see :class:`~giril_rl.training.ppo.PPO`.
-        time_limit: steps of an episode, for ``cfg.time_aware_critic``.
 
     Raises:
-        UserError: for another ``termination``, or critics that are to see the time without a limit.
+        UserError: for another ``termination``.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -98,13 +95,7 @@ class SAC:
         relabel_episodes: Callable[[TensorDictBase], TensorDictBase] | None = None,
         scaling: ReturnScaling | None = None,
         termination: str = "ends",
-        time_limit: int | None = None,
     ) -> None:
-        if cfg.time_aware_critic and time_limit is None:
-            raise UserError(
-                "sac.time_aware_critic=true: the environment has no time limit of which a share "
-                "could be over: set it to false, or give the environment a limit."
-            )
         if termination not in ("ends", "bootstrap"):
             raise UserError(f"termination={termination}: choose one of ends, bootstrap.")
         self.agent, self.cfg = agent, cfg
@@ -118,8 +109,7 @@ class SAC:
         self.bootstraps_failure = termination == "bootstrap"
         self.relabel, self.scaling = relabel, scaling
         self.relabel_episodes = relabel_episodes
-        self.held, self.clock = HeldEpisodes(), EpisodeClock()
-        self._time_limit = time_limit if cfg.time_aware_critic else None
+        self.held = HeldEpisodes()
         self._taken = self._updates = 0
         self._demonstration, self._folder = demonstration, folder
         self.replay: Replay | None = None
@@ -127,8 +117,7 @@ class SAC:
             loss = _loss(agent, cfg)
         self.loss = loss
         inputs: list[NestedKey] = [OBSERVATION, ACTION if agent.discrete else DRAWN]
-        times = [] if self._time_limit is None else [ELAPSED, ("next", ELAPSED)]
-        self.keys = (*inputs, NEXT, REWARD, DONE, TERMINATED, *times)
+        self.keys = (*inputs, NEXT, REWARD, DONE, TERMINATED)
         self.gradients = TracedGradients(
             loss, keys=self.keys, log=("alpha", "entropy"), compile=cfg.compile
         )
@@ -149,10 +138,6 @@ class SAC:
         if self.scaling is not None:
             self.scaling.unfreeze()(batch)
             self.scaling.freeze()
-        if self._time_limit is not None:
-            batch = batch.clone(False).set(
-                ELAPSED, self.clock(batch).unsqueeze(-1) / self._time_limit
-            )
         if self.relabel_episodes is None:
             self._store(batch.flatten(0, 1))
         else:
@@ -213,17 +198,14 @@ class SAC:
         if self.bootstraps_failure:
             terminated = torch.zeros_like(terminated)
         onward = drawn.get(ONWARD, None)
-        columns = [
+        columns = (
             agent.normalised(drawn.get(OBSERVATION)),
             agent.drawn(drawn.get(ACTION)),
             agent.normalised(drawn.get(NEXT) if onward is None else onward),
             reward,
             terminated,  # Takes the place of done, by which the loss does not look.
             terminated,
-        ]
-        if self._time_limit is not None:
-            elapsed = drawn.get(ELAPSED)
-            columns += elapsed, elapsed + 1 / self._time_limit
+        )
         return zip(*(column.split(cfg.batch) for column in columns), strict=True)
 
     def _replay(self, keys: Sequence[NestedKey]) -> Replay:
@@ -248,7 +230,6 @@ class SAC:
             "loss": _tensors(self.loss),
             "optimizer": self.optimizer.state_dict(),
             "held": self.held.state_dict(),
-            "clock": None if self._time_limit is None else self.clock.state_dict(),
             "replay": None if self.replay is None else self.replay.state_dict(),
             "scaling": None if self.scaling is None else dict(self.scaling.state_dict()),
             "steps": self._taken,
@@ -266,8 +247,6 @@ class SAC:
         if self.scaling is not None:
             self.scaling.load_state_dict(state["scaling"])
         self.held.load_state_dict(state["held"])
-        if self._time_limit is not None:
-            self.clock.load_state_dict(state["clock"])
         self._taken, self._updates = state["steps"], state["updates"]
         self.replay = None
         if state["replay"] is not None:
@@ -326,17 +305,18 @@ def _loss(agent: SACAgent, cfg: SACConfig) -> SACLoss | DiscreteSACLoss:
         "alpha_init": _NO_ENTROPY if cfg.entropy == "none" else cfg.temperature,
         "target_entropy": "auto" if cfg.target_entropy is None else cfg.target_entropy,
     }
-    critic = agent.critic(time_aware=cfg.time_aware_critic)
     loss: SACLoss | DiscreteSACLoss
     if agent.discrete:
         encoding = "one_hot" if agent.one_hot else "categorical"
         kind = DiscreteSACLoss if tuned else _FixedDiscreteSACLoss
         settings |= {"action_space": encoding, "num_actions": agent.action_size}
-        loss = kind(agent.actor_for_loss(), critic, **settings)
+        loss = kind(agent.actor_for_loss(), agent.critic(), **settings)
     else:
         if cfg.target_entropy is None:
             settings["target_entropy"] = -float(agent.action_size)
-        loss = (SACLoss if tuned else _FixedSACLoss)(agent.actor_for_loss(), critic, **settings)
+        loss = (SACLoss if tuned else _FixedSACLoss)(
+            agent.actor_for_loss(), agent.critic(), **settings
+        )
         assert loss.target_entropy is not None  # It becomes a buffer when it is first read.
     loss.make_value_estimator(ValueEstimators.TD0, gamma=cfg.gamma)
     return loss.to(agent.device)

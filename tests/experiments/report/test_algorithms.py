@@ -266,7 +266,7 @@ def test_learner_and_reward_with_settings_that_differ_from_the_recipes_own(made)
     """Each beside its own twin; settings of one algorithm have none in the other."""
     for algorithm, own, pwil, giril in (
         (PPO, "ppo.lr=0.002", -990.0, 20.0),
-        (SAC, "sac.time_aware_critic=true", 700.0, 30.0),
+        (SAC, "sac.lr=0.002", 700.0, 30.0),
     ):
         made("pwil", algorithm, own, score=pwil)
         made("giril", algorithm, PAPER, "demo.subsample=1", score=giril)
