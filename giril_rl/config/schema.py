@@ -182,6 +182,11 @@ class SACConfig(_Batches):
         low=0,
         low_open=True,
     )
+    time_aware_critic: bool = knob(
+        False,
+        "the critics also see gamma^t, t the episode's steps so far, the actor does not: for "
+        "rewards that depend on what the episode visited before, such as PWIL's",
+    )
     random_steps: int = knob(1_000, "environment steps of random actions before learning", low=0)
     buffer_size: int = knob(1_000_000, "transitions in the replay buffer, on disk", low=1)
     demonstration: str = knob(
@@ -203,6 +208,15 @@ class SACConfig(_Batches):
         "torch.compile of whole gradient steps and of the acting policy: pays from some 20,000 "
         "steps on; 10 to 40 seconds to begin",
     )
+
+    def check(self, prefix: str, run: object) -> None:
+        """Refuses a precision of products that there are none of."""
+        if self.precision == "bf16" and len(self.hidden) < 2:
+            raise UserError(
+                f"{prefix}precision=bf16 is of products between hidden layers, and "
+                f"{prefix}hidden={self.hidden} is one: give two or more, or leave the precision "
+                "out."
+            )
 
 
 def idle_algorithm(algorithm: object) -> str:

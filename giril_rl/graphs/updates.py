@@ -29,8 +29,11 @@ class CompiledUpdate:
     Args:
         gradients: of the loss, made with ``compile=True``; its own graph is not recorded.
         optimizer: torch's Adam with the ``parameters`` of ``gradients`` in one group, without
-            weight decay. Its step size must stay.
+            weight decay, amsgrad or maximize. Its step size must stay.
         targets: TorchRL's update of the loss's target networks; None for a loss without.
+
+    Raises:
+        ValueError: for other settings of the optimizer, or ``targets`` of a loss that has none.
 
     Examples:
         >>> from torchrl.modules import QValueActor
@@ -51,6 +54,9 @@ class CompiledUpdate:
         targets: SoftUpdate | None = None,
     ) -> None:
         (self._group,) = optimizer.param_groups
+        for name in ("weight_decay", "amsgrad", "maximize"):
+            if self._group[name]:
+                raise ValueError(f"{name}={self._group[name]} is not part of the compiled step")
         _begin(optimizer)
         self._gradients = gradients
         self._module = _WithMoments(gradients, optimizer)
@@ -60,6 +66,8 @@ class CompiledUpdate:
             for name, _ in gradients.module.named_buffers():
                 if name.removeprefix("target_") in trained:
                     self._targets[name] = name.removeprefix("target_")
+            if not self._targets:
+                raise ValueError("the loss has no target networks that the update could move")
             self._tau = 1 - targets.eps
         self._graph = ModuleGraph(self._module, self._whole_step, **gradients.graph_settings)
 

@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from itertools import chain, repeat
-from typing import Any, Literal
+from typing import Literal, get_args
 
 import torch.nn.functional as F
 from torch import Tensor, nn
+
+from giril_rl.errors import UserError
 
 Precision = Literal["fp32", "bf16"]
 
 
 class BFloat16Linear(nn.Linear):
-    """A linear layer whose product is of bfloat16 numbers; parameters and result are float32.
+    """A linear layer whose product is of bfloat16 numbers; parameters and result are its own dtype.
 
     Products are rounded to bfloat16 once they are summed. Gradients are of the same kind.
 
@@ -26,30 +26,37 @@ class BFloat16Linear(nn.Linear):
 
     def forward(self, input: Tensor) -> Tensor:
         """The layer's result for ``(*batch, in_features)``."""
-        product = F.linear(input.bfloat16(), self.weight.bfloat16()).float()
+        product = F.linear(input.bfloat16(), self.weight.bfloat16()).to(input.dtype)
         return product if self.bias is None else product + self.bias
 
 
-def layers_of(count: int, precision: Precision) -> Callable[..., nn.Linear]:
-    """Makes the linear layers of a perceptron one after the other.
+def in_precision(network: nn.Sequential, precision: Precision) -> nn.Sequential:
+    """Puts :class:`BFloat16Linear` between the hidden units of a perceptron, for ``"bf16"``.
 
-    With ``"bf16"`` those between hidden units are :class:`BFloat16Linear`. The first and the last
-    stay in float32: observations may differ by less than bfloat16 tells apart, and so may values
-    and actions.
+    The first and the last layer stay as they are: observations may differ by less than bfloat16
+    tells apart, and so may values and actions. Weights stay, too.
 
     Args:
-        count: how many layers will be made.
-        precision: "fp32" or "bf16".
+        network: changed in place.
+        precision: "fp32", which changes nothing, or "bf16".
+
+    Raises:
+        UserError: for another precision.
 
     Examples:
-        >>> make = layers_of(3, "bf16")
-        >>> [type(make(2, 2)).__name__ for _ in range(3)]
-        ['Linear', 'BFloat16Linear', 'Linear']
+        >>> network = nn.Sequential(nn.Linear(2, 8), nn.ReLU(), nn.Linear(8, 8), nn.Linear(8, 1))
+        >>> [type(part).__name__ for part in in_precision(network, "bf16")]
+        ['Linear', 'ReLU', 'BFloat16Linear', 'Linear']
     """
-    between = repeat(BFloat16Linear if precision == "bf16" else nn.Linear, count - 2)
-    kinds: Iterator[type[nn.Linear]] = chain([nn.Linear], between, [nn.Linear])
-
-    def make(in_features: int, out_features: int, **settings: Any) -> nn.Linear:
-        return next(kinds)(in_features, out_features, **settings)
-
-    return make
+    if precision not in get_args(Precision):
+        raise UserError(f"precision={precision!r} is unknown: choose fp32 or bf16.")
+    if precision == "bf16":
+        places = [index for index, part in enumerate(network) if isinstance(part, nn.Linear)]
+        for index in places[1:-1]:
+            layer = network[index]
+            sizes = layer.in_features, layer.out_features
+            # Without weights of its own, whose making would draw random numbers.
+            half = BFloat16Linear(*sizes, bias=layer.bias is not None, device="meta")
+            half.load_state_dict(layer.state_dict(keep_vars=True), assign=True)
+            network[index] = half
+    return network

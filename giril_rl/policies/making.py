@@ -85,7 +85,7 @@ def make_sac_agent(
             hidden=cfg.hidden,
             normalise=cfg.normalise_observations,
             noise=cfg.noise if cfg.entropy == "none" else None,
-            precision="bf16" if cfg.precision == "bf16" else "fp32",
+            precision=cfg.precision,  # type: ignore[arg-type]
         )
 
 

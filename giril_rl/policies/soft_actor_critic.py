@@ -14,12 +14,14 @@ from torchrl.modules.distributions import OneHotCategorical
 from giril_rl.errors import UserError
 from giril_rl.networks.action_bounds import ActionBounds, single_action_spec
 from giril_rl.networks.normalise import RunningNormaliser
-from giril_rl.networks.precision import Precision, layers_of
+from giril_rl.networks.precision import Precision, in_precision
 from giril_rl.policies.agent import Agent
 from giril_rl.runs.pretrained import remembered
 
 DRAWN = "drawn_action"
 """An action in units in which the bounds are -1 and 1; critics and losses see these."""
+ELAPSED = "elapsed"
+"""``gamma ** t`` after t steps of an episode: 1 where it begins, and hardly more than 0 later."""
 _EDGE = 1 - 1e-6
 """Largest squashed action whose log-density is finite in float32."""
 
@@ -38,11 +40,10 @@ class SACAgent(Agent):
         hidden: hidden layers of actor and critics.
         normalise: whether observations are normalised with running statistics.
         noise: standard deviation before squashing; None lets the network choose it for each state.
-        precision: "fp32", or "bf16" for products in bfloat16 between hidden layers, see
-            :func:`giril_rl.networks.precision.layers_of`.
+        precision: "fp32", or "bf16" for products in bfloat16 between hidden layers.
 
     Raises:
-        UserError: for an action spec of another kind.
+        UserError: for an action spec of another kind, or an unknown precision.
 
     Examples:
         >>> from tensordict import TensorDict
@@ -84,13 +85,9 @@ class SACAgent(Agent):
         self.actor = nn.Sequential(self._mlp(observation_size, outputs), *head)
 
     def _mlp(self, inputs: int, outputs: int) -> MLP:
-        return MLP(
-            inputs,
-            outputs,
-            num_cells=self.hidden,
-            activation_class=nn.ReLU,
-            layer_class=layers_of(len(self.hidden) + 1, self.precision),
-        )
+        network = MLP(inputs, outputs, num_cells=self.hidden, activation_class=nn.ReLU)
+        in_precision(network, self.precision)
+        return network
 
     def normalised(self, observation: Tensor) -> Tensor:
         """Raw observations ``(*batch, observation_size)`` as actor and critics see them."""
@@ -184,14 +181,20 @@ class SACAgent(Agent):
             return_log_prob=True,
         )
 
-    def critic(self) -> TensorDictModule:
-        """A new critic: of observation and drawn action, or of every discrete action."""
+    def critic(self, *, time_aware: bool = False) -> TensorDictModule:
+        """A new critic: of observation and drawn action, or of every discrete action.
+
+        Args:
+            time_aware: whether it also reads :data:`ELAPSED`, ``(*batch, 1)``.
+        """
+        seen = ["observation", *([ELAPSED] if time_aware else [])]
+        size = self.observation_size + time_aware
         if self.discrete:
-            network = self._mlp(self.observation_size, self.action_size)
-            return TensorDictModule(network, in_keys=["observation"], out_keys=["action_value"])
+            network = self._mlp(size, self.action_size)
+            return TensorDictModule(network, in_keys=seen, out_keys=["action_value"])
         return TensorDictModule(
-            self._mlp(self.observation_size + self.action_size, 1),
-            in_keys=["observation", DRAWN],
+            self._mlp(size + self.action_size, 1),
+            in_keys=[*seen, DRAWN],
             out_keys=["state_action_value"],
         )
 

@@ -22,7 +22,12 @@ from giril_rl.config.schema import USE_ACTIONS, knob
 from giril_rl.errors import UserError
 from giril_rl.rewards.method import GREEN, Method, register
 from giril_rl.rewards.points import Atoms
-from giril_rl.rewards.trajectory import TrajectoryReward, check_vectors, spaces_of
+from giril_rl.rewards.trajectory import (
+    TrajectoryReward,
+    check_vectors,
+    spaces_of,
+    steps_before,
+)
 from giril_rl.rewards.transitions import REWARD_KEYS
 from giril_rl.runs.pretrained import remembered
 
@@ -221,7 +226,8 @@ class PWILReward(TrajectoryReward):
         points = self.atoms.points
         # The squared distance less |x|^2, which is the same for all atoms.
         near = torch.addmm(self.atoms.squares, x.flatten(0, 1), points.T, alpha=-2)
-        paid = self._played(over) < self.horizon
+        before = (self.full * len(points) - self.left.sum(1)) // self.each
+        paid = self.horizon > steps_before(ends, before).T
         step, atom, taken, self.left = greedy_coupling(
             near.view(*x.shape[:2], -1), self.left, paid * self.each, over, self.full
         )
@@ -232,13 +238,6 @@ class PWILReward(TrajectoryReward):
             cost, alpha=self.alpha, beta=self.beta, horizon=self.horizon, size=points.shape[1]
         )
         return torch.where(paid, value, 0.0).T
-
-    def _played(self, ends: Tensor) -> Tensor:
-        """Steps ``(T, N)`` that each episode had before."""
-        before = (self.full * self.left.shape[1] - self.left.sum(1)) // self.each
-        time = torch.arange(len(ends), device=ends.device).unsqueeze(-1)
-        begins = torch.where(ends, time + 1, -before).cummax(0).values
-        return time - torch.cat([-before.unsqueeze(0), begins[:-1]])
 
     def extra_repr(self) -> str:
         """Shows T, alpha and beta when printed."""

@@ -206,6 +206,23 @@ class TrajectoryReward(Pretrained, TensorDictModuleBase):
         super()._load_from_state_dict(state_dict, prefix, *args, **kwargs)
 
 
+def steps_before(ends: Tensor, before: Tensor) -> Tensor:
+    """The steps that each step's episode had before it.
+
+    Args:
+        ends: bool ``(environments, time)``, after which steps an episode ends.
+        before: the steps ``(environments,)`` that running episodes had before the first one.
+
+    Examples:
+        >>> steps_before(torch.tensor([[False, True, False]]), torch.tensor([7]))
+        tensor([[7, 8, 0]])
+    """
+    time = torch.arange(ends.shape[1], device=ends.device)
+    first = -before.unsqueeze(1)
+    begins = torch.where(ends, time + 1, first).cummax(1).values
+    return time - torch.cat([first, begins[:, :-1]], 1)
+
+
 @contextmanager
 def fresh_episodes(part: nn.Module, *, learn: bool = False) -> Iterator[None]:
     """:meth:`TrajectoryReward.fresh_episodes` of all trajectory rewards inside a transform.

@@ -52,6 +52,7 @@ ADDED = {
     "reward.every": 20,
     "held_episodes": 20,
     "demo.first": None,
+    "sac.time_aware_critic": False,
     "sac.precision": "fp32",
     **dict.fromkeys(("reward.use_actions", "giril.use_actions", "icm.use_actions"), True),
 }

@@ -7,7 +7,7 @@ from typing import Any, Protocol
 
 import torch
 from tensordict import TensorDictBase
-from torch import nn
+from torch import Tensor, nn
 
 from giril_rl.config.schema import DemoConfig, RunConfig, replay_needs_actions
 from giril_rl.demos import Demonstration, subsample
@@ -15,7 +15,8 @@ from giril_rl.envs import BatchedEnv
 from giril_rl.errors import UserError
 from giril_rl.policies.agent import Agent
 from giril_rl.policies.making import make_agent, make_sac_agent
-from giril_rl.rewards.trajectory import fresh_episodes, trajectory_rewards
+from giril_rl.policies.soft_actor_critic import ELAPSED
+from giril_rl.rewards.trajectory import fresh_episodes, steps_before, trajectory_rewards
 from giril_rl.runs.randomness import Use
 from giril_rl.runs.run import Run
 from giril_rl.training.ppo import PPO, return_scaling
@@ -112,6 +113,8 @@ def make_algorithm(
     known = None
     if demo is not None and cfg.sac.demonstration != "none":
         known = _demonstrated(demo, cfg, transform, moving, demonstration_reward)
+        if cfg.sac.time_aware_critic:
+            known.set(ELAPSED, cfg.sac.gamma ** _steps(demo)[:: _every(cfg)].float())
     settings = getattr(cfg, "scaling", None)
     scaling = return_scaling(settings, cfg.sac.gamma) if settings is not None else []
     return SAC(
@@ -180,6 +183,13 @@ def _demonstrated(
         with fresh_episodes(transform):
             known = transform(known.unsqueeze(0).to(cfg.device)).squeeze(0)
     return subsample(Demonstration(known.cpu()), _every(cfg))
+
+
+def _steps(demo: Demonstration) -> Tensor:
+    """Each transition's place ``(n, 1)`` in its episode."""
+    episode = demo.transitions["episode"].reshape(1, -1)
+    ends = episode.diff(append=episode[:, -1:]) != 0
+    return steps_before(ends, torch.zeros(1, dtype=torch.int64)).reshape(-1, 1)
 
 
 def pairs_of(cfg: RunConfig, demo: Demonstration) -> int:

@@ -1,4 +1,4 @@
-"""Episodes across collected batches: their true returns and lengths, and their steps held back."""
+"""Episodes across collected batches: their true returns, their steps held back, their time."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ from typing import Any
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
+
+from giril_rl.rewards.trajectory import steps_before
 
 
 class EpisodeTracker(nn.Module):
@@ -72,6 +74,61 @@ class EpisodeTracker(nn.Module):
         return returns, lengths
 
 
+class _Continuity:
+    """Tells which environments do not go on from where the last batch left them."""
+
+    def __init__(self) -> None:
+        self.onward: Tensor | None = None
+
+    def moved(self, batch: TensorDictBase) -> Tensor:
+        """A mask ``(num_envs,)`` for a batch ``(num_envs, time)``, the next one."""
+        first = batch.get("observation")[:, 0]
+        before = first if self.onward is None else self.onward
+        onward = batch.get(("next", "following_observation"), None)
+        onward = batch.get(("next", "observation")) if onward is None else onward
+        self.onward = onward[:, -1].clone()
+        return (first != before).flatten(1).any(1)
+
+
+class EpisodeClock:
+    """Counts the steps of running episodes across batches.
+
+    Where an environment does not go on from where it was, an episode begins.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> states = torch.arange(4.0).reshape(1, 4, 1)
+        >>> done = torch.tensor([[False, True, False, False]]).unsqueeze(-1)
+        >>> after = {"observation": states + 1, "done": done}
+        >>> batch = TensorDict({"observation": states, "next": after}, [1, 4])
+        >>> EpisodeClock()(batch)
+        tensor([[0, 1, 0, 1]])
+    """
+
+    def __init__(self) -> None:
+        self._continuity = _Continuity()
+        self._before = torch.zeros(0, dtype=torch.int64)
+
+    def __call__(self, batch: TensorDictBase) -> Tensor:
+        """The steps ``(num_envs, time)`` before each one of its episode."""
+        done = batch.get(("next", "done")).squeeze(-1)
+        if not len(self._before):
+            self._before = torch.zeros(len(done), dtype=torch.int64)
+        moved = self._continuity.moved(batch)
+        steps = steps_before(done, self._before.masked_fill(moved, 0))
+        self._before = (steps[:, -1] + 1).masked_fill(done[:, -1], 0)
+        return steps
+
+    def state_dict(self) -> dict[str, Any]:
+        """What the next batch's steps depend on."""
+        return {"before": self._before, "onward": self._continuity.onward}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restores what :meth:`state_dict` gave."""
+        self._before, self._continuity.onward = state["before"], state["onward"]
+
+
 class HeldEpisodes:
     """Holds back the steps of running episodes until their episode ends.
 
@@ -95,7 +152,7 @@ class HeldEpisodes:
     def __init__(self) -> None:
         self._held: TensorDictBase | None = None
         self._begins: list[int] = []
-        self._onward = torch.zeros(0)
+        self._continuity = _Continuity()
 
     def add(self, batch: TensorDictBase) -> list[TensorDictBase]:
         """Takes a batch ``(num_envs, time)``; gives the episodes that end in it, ``(1, length)``.
@@ -103,16 +160,13 @@ class HeldEpisodes:
         Where an environment does not go on from where it was, its running episode is dropped.
         """
         before = 0 if self._held is None else self._held.shape[1]
+        moved = self._continuity.moved(batch)
         if self._held is None:
             self._held, self._begins = batch, [0] * batch.shape[0]
         else:
-            moved = (batch.get("observation")[:, 0] != self._onward).flatten(1).any(1)
             for index in moved.nonzero().flatten().tolist():
                 self._begins[index] = before
             self._held = torch.cat([self._held, batch], 1)
-        onward = batch.get(("next", "following_observation"), None)
-        onward = batch.get(("next", "observation")) if onward is None else onward
-        self._onward = onward[:, -1].clone()
         episodes = []
         for index, step in batch.get(("next", "done")).squeeze(-1).nonzero().tolist():
             end = before + step + 1
@@ -132,13 +186,13 @@ class HeldEpisodes:
             "begins": self._begins,
             "columns": columns,
             "shape": list(self._held.shape),
-            "onward": self._onward,
+            "onward": self._continuity.onward,
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restores what :meth:`state_dict` gave."""
         if not state:
-            self._held, self._begins = None, []
+            self._held, self._begins, self._continuity.onward = None, [], None
             return
         self._held = TensorDict(state["columns"], state["shape"]).unflatten_keys(".")
-        self._begins, self._onward = list(state["begins"]), state["onward"]
+        self._begins, self._continuity.onward = list(state["begins"]), state["onward"]

@@ -20,9 +20,9 @@ from giril_rl.errors import UserError
 from giril_rl.graphs.gradients import TracedGradients
 from giril_rl.graphs.updates import CompiledUpdate
 from giril_rl.policies.agent import ActingPolicy, collecting
-from giril_rl.policies.soft_actor_critic import DRAWN, SACAgent
+from giril_rl.policies.soft_actor_critic import DRAWN, ELAPSED, SACAgent
 from giril_rl.runs.randomness import seeded, stream_seed
-from giril_rl.training.episodes import HeldEpisodes
+from giril_rl.training.episodes import EpisodeClock, HeldEpisodes
 from giril_rl.training.replay import Replay
 from giril_rl.transforms.scaling import ReturnScaling
 
@@ -30,8 +30,9 @@ OBSERVATION, ACTION = "observation", "action"
 NEXT, ONWARD = ("next", "observation"), ("next", "following_observation")
 REWARD, TERMINATED = ("next", "reward"), ("next", "terminated")
 DONE = ("next", "done")
-STORED: tuple[NestedKey, ...] = (OBSERVATION, ACTION, NEXT, TERMINATED, ONWARD)
-"""What a minibatch has besides a stored reward; the last only where there are hidden resets."""
+STORED: tuple[NestedKey, ...] = (OBSERVATION, ACTION, NEXT, TERMINATED, ONWARD, ELAPSED)
+"""What a minibatch has besides a stored reward; the last two only where there are hidden resets and
+where critics see the time."""
 
 
 class SAC:
@@ -48,6 +49,7 @@ class SAC:
         seed: seed of the critics' weights.
         folder: where the replay buffer's files are; None keeps it in memory.
         demonstration: flat transitions with a reward, for ``cfg.demonstration``; None for none.
+            With ``"elapsed"``, ``gamma ** t``, for ``cfg.time_aware_critic``.
         relabel: a transform that writes the reward into a flat minibatch; None takes the stored.
         relabel_episodes: writes the reward into whole episodes ``(1, length)``, which are stored
             once they have ended; None stores each batch.
@@ -109,7 +111,7 @@ class SAC:
         self.bootstraps_failure = termination == "bootstrap"
         self.relabel, self.scaling = relabel, scaling
         self.relabel_episodes = relabel_episodes
-        self.held = HeldEpisodes()
+        self.held, self.clock = HeldEpisodes(), EpisodeClock()
         self._taken = self._updates = 0
         self._demonstration, self._folder = demonstration, folder
         self.replay: Replay | None = None
@@ -117,7 +119,8 @@ class SAC:
             loss = _loss(agent, cfg)
         self.loss = loss
         inputs: list[NestedKey] = [OBSERVATION, ACTION if agent.discrete else DRAWN]
-        self.keys = (*inputs, NEXT, REWARD, DONE, TERMINATED)
+        times = [ELAPSED, ("next", ELAPSED)] if cfg.time_aware_critic else []
+        self.keys = (*inputs, NEXT, REWARD, DONE, TERMINATED, *times)
         self.gradients = TracedGradients(
             loss, keys=self.keys, log=("alpha", "entropy"), compile=cfg.compile
         )
@@ -138,6 +141,9 @@ class SAC:
         if self.scaling is not None:
             self.scaling.unfreeze()(batch)
             self.scaling.freeze()
+        if self.cfg.time_aware_critic:
+            elapsed = self.cfg.gamma ** self.clock(batch).unsqueeze(-1).float()
+            batch = batch.clone(False).set(ELAPSED, elapsed)
         if self.relabel_episodes is None:
             self._store(batch.flatten(0, 1))
         else:
@@ -198,14 +204,17 @@ class SAC:
         if self.bootstraps_failure:
             terminated = torch.zeros_like(terminated)
         onward = drawn.get(ONWARD, None)
-        columns = (
+        columns = [
             agent.normalised(drawn.get(OBSERVATION)),
             agent.drawn(drawn.get(ACTION)),
             agent.normalised(drawn.get(NEXT) if onward is None else onward),
             reward,
             terminated,  # Takes the place of done, by which the loss does not look.
             terminated,
-        )
+        ]
+        if cfg.time_aware_critic:
+            elapsed = drawn.get(ELAPSED)
+            columns += elapsed, elapsed * cfg.gamma
         return zip(*(column.split(cfg.batch) for column in columns), strict=True)
 
     def _replay(self, keys: Sequence[NestedKey]) -> Replay:
@@ -230,6 +239,7 @@ class SAC:
             "loss": _tensors(self.loss),
             "optimizer": self.optimizer.state_dict(),
             "held": self.held.state_dict(),
+            "clock": self.clock.state_dict() if self.cfg.time_aware_critic else None,
             "replay": None if self.replay is None else self.replay.state_dict(),
             "scaling": None if self.scaling is None else dict(self.scaling.state_dict()),
             "steps": self._taken,
@@ -247,6 +257,8 @@ class SAC:
         if self.scaling is not None:
             self.scaling.load_state_dict(state["scaling"])
         self.held.load_state_dict(state["held"])
+        if self.cfg.time_aware_critic:
+            self.clock.load_state_dict(state["clock"])
         self._taken, self._updates = state["steps"], state["updates"]
         self.replay = None
         if state["replay"] is not None:
@@ -305,18 +317,17 @@ def _loss(agent: SACAgent, cfg: SACConfig) -> SACLoss | DiscreteSACLoss:
         "alpha_init": _NO_ENTROPY if cfg.entropy == "none" else cfg.temperature,
         "target_entropy": "auto" if cfg.target_entropy is None else cfg.target_entropy,
     }
+    critic = agent.critic(time_aware=cfg.time_aware_critic)
     loss: SACLoss | DiscreteSACLoss
     if agent.discrete:
         encoding = "one_hot" if agent.one_hot else "categorical"
         kind = DiscreteSACLoss if tuned else _FixedDiscreteSACLoss
         settings |= {"action_space": encoding, "num_actions": agent.action_size}
-        loss = kind(agent.actor_for_loss(), agent.critic(), **settings)
+        loss = kind(agent.actor_for_loss(), critic, **settings)
     else:
         if cfg.target_entropy is None:
             settings["target_entropy"] = -float(agent.action_size)
-        loss = (SACLoss if tuned else _FixedSACLoss)(
-            agent.actor_for_loss(), agent.critic(), **settings
-        )
+        loss = (SACLoss if tuned else _FixedSACLoss)(agent.actor_for_loss(), critic, **settings)
         assert loss.target_entropy is not None  # It becomes a buffer when it is first read.
     loss.make_value_estimator(ValueEstimators.TD0, gamma=cfg.gamma)
     return loss.to(agent.device)

@@ -117,3 +117,26 @@ def test_compiled():
                 optimizer.step()
         found.append(gradients.parameters[0].detach().clone())
     torch.testing.assert_close(*found)
+
+
+@pytest.mark.parametrize("changed", [{"weight_decay": 0.1}, {"amsgrad": True}, {"maximize": True}])
+def test_an_optimizer_that_does_more_is_refused(changed):
+    learner = Learner("box", compile=True)
+    optimizer = torch.optim.Adam(learner.gradients.parameters, **changed)
+    with pytest.raises(ValueError, match="is not part of the compiled step"):
+        CompiledUpdate(learner.gradients, optimizer, learner.targets)
+
+
+def test_targets_of_a_loss_without_any_are_refused():
+    class Square(nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.weight = nn.Parameter(torch.ones(()))
+
+        def forward(self, batch):
+            return TensorDict({"loss_square": self.weight.square()})
+
+    gradients = TracedGradients(Square(), keys=["x"], compile=True)
+    optimizer = torch.optim.Adam(gradients.parameters)
+    with pytest.raises(ValueError, match="has no target networks"):
+        CompiledUpdate(gradients, optimizer, Learner("box", compile=True).targets)

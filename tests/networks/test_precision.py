@@ -1,11 +1,18 @@
 """Products in bfloat16: how far from float32, in which layers, and that agents learn and resume."""
 
+import pickle
+
 import pytest
 import torch
 from torch import nn
 from torchrl.data import Bounded
 
+from giril_rl.cli.command_line import main
+from giril_rl.config.schema import SACConfig, TaskConfig
+from giril_rl.envs import make_env
+from giril_rl.errors import UserError
 from giril_rl.networks.precision import BFloat16Linear
+from giril_rl.policies import make_sac_agent
 from giril_rl.policies.soft_actor_critic import SACAgent
 
 SPEC = Bounded(-1, 1, shape=(2,))
@@ -60,6 +67,30 @@ def test_weights_begin_the_same_and_actions_nearly_so():
     x = torch.randn(100, 6)
     exact, rounded = (agent.act(x, greedy=True)[0] for agent in both.values())
     assert 0 < (exact - rounded).abs().max() < 0.01
+
+
+def test_the_settings_precision_is_the_agents():
+    env = make_env(TaskConfig(name="pendulum", env_id="Pendulum-v1"), 1, seed=0)
+    for precision in ("fp32", "bf16"):
+        agent = make_sac_agent(env, SACConfig(precision=precision), seed=0)
+        kinds = {type(part) for part in agent.modules()}
+        assert (BFloat16Linear in kinds) == (precision == "bf16")
+
+
+def test_what_has_no_such_products_is_refused(capsys):
+    with pytest.raises(UserError, match="precision='half' is unknown: choose fp32 or bf16"):
+        SACAgent(6, SPEC, precision="half")
+    assert main(["run", "pwil", "sac.hidden=[64]", "sac.precision=bf16"]) == 2
+    assert "sac.hidden=[64] is one: give two or more" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("precision", ["fp32", "bf16"])
+def test_an_agent_goes_to_other_processes(precision):
+    agent = SACAgent(6, SPEC, hidden=[16, 16], precision=precision)
+    x = torch.randn(9, 6)
+    there = pickle.loads(pickle.dumps(agent))
+    assert torch.equal(there.act(x, greedy=True)[0], agent.act(x, greedy=True)[0])
+    pickle.loads(pickle.dumps(agent.acting()))
 
 
 @pytest.mark.parametrize("precision", ["fp32", "bf16"])

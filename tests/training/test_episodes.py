@@ -3,7 +3,7 @@ import torch
 from tensordict import TensorDict
 
 from giril_rl.runs.checkpoint import load_state, save_state
-from giril_rl.training.episodes import EpisodeTracker
+from giril_rl.training.episodes import EpisodeClock, EpisodeTracker
 
 
 def batch(reward, done):
@@ -102,3 +102,49 @@ def test_an_episode_of_atari_is_a_whole_game():
     assert returns.tolist() == [15.0, 16.0] and lengths.tolist() == [4, 1]
     returns, lengths = tracker(data)
     assert returns.tolist() == [47.0, 16.0] and lengths.tolist() == [5, 1]
+
+
+# Time
+
+
+def walk(num_envs, time, share, generator):
+    """Random states, each of which is the last one's next, but after an end."""
+    states = torch.randn(num_envs, time + 1, 2, generator=generator)
+    done = torch.rand(num_envs, time, 1, generator=generator) < share
+    after = torch.where(done, torch.zeros(()), states[:, 1:])
+    following = {"observation": after, "done": done}
+    return TensorDict({"observation": states[:, :-1], "next": following}, [num_envs, time])
+
+
+@pytest.mark.parametrize("share", [0.0, 0.2, 1.0])
+@pytest.mark.parametrize("length", [1, 7, 40])
+def test_the_clock_equals_a_plain_loop_however_time_is_cut(length, share, tmp_path):
+    data = walk(3, 40, share, torch.Generator().manual_seed(0))
+    expected = torch.zeros(3, 40, dtype=torch.int64)
+    for index in range(3):
+        for time in range(1, 40):
+            ended = bool(data["next", "done"][index, time - 1])
+            expected[index, time] = 0 if ended else expected[index, time - 1] + 1
+    clock, found = EpisodeClock(), []
+    for part in data.split(length, 1):
+        found.append(clock(part))
+        save_state(tmp_path / "state", clock.state_dict())
+        clock = EpisodeClock()
+        clock.load_state_dict(load_state(tmp_path / "state"))
+    assert torch.equal(torch.cat(found, 1), expected)
+
+
+def test_the_clock_begins_anew_where_an_environment_was_reset_in_between():
+    generator = torch.Generator().manual_seed(0)
+    clock = EpisodeClock()
+    clock(walk(2, 5, 0.0, generator))
+    assert clock(walk(2, 2, 0.0, generator)).tolist() == [[0, 1], [0, 1]]
+
+
+def test_the_clock_goes_on_after_a_hidden_reset():
+    """An episode of fixed length goes on from another observation than the failure's."""
+    data = walk(1, 6, 0.0, torch.Generator().manual_seed(0))
+    data["next", "following_observation"] = data["next", "observation"].clone()
+    data["next", "observation"][0, 2] = 9.0
+    clock = EpisodeClock()
+    assert [clock(part).item() for part in data.split(1, 1)] == [0, 1, 2, 3, 4, 5]

@@ -13,6 +13,7 @@ from torchrl.data import Bounded, Categorical, OneHot, Unbounded
 from torchrl.envs import Compose
 
 from giril_rl.config.schema import SACConfig, TaskConfig
+from giril_rl.demos import Demonstration
 from giril_rl.envs import GymVectorEnv
 from giril_rl.errors import UserError
 from giril_rl.policies import make_sac_agent
@@ -21,6 +22,7 @@ from giril_rl.rewards import DiscriminatorReward
 from giril_rl.runs.interrupt import Interrupted
 from giril_rl.runs.run import Run
 from giril_rl.training import SAC, evaluate, evaluate_both, train_policy
+from giril_rl.training.algorithm import _steps
 from giril_rl.transforms import IntrinsicReward
 from giril_rl.transforms.scaling import ReturnScaling
 
@@ -59,6 +61,8 @@ def train(folder, *, kind="box", garbage=None, moving=False, whole=False, known=
         torch.manual_seed(0)
         played = env.rollout(20, break_when_any_done=False).flatten(0, 1).exclude("collector")
         demonstration = transform(played)
+        if cfg.time_aware_critic:
+            demonstration["elapsed"] = 0.99 ** (torch.arange(80) % 20.0).unsqueeze(-1)
         env.set_seed(0)
     with Run.open(folder, {}, recipe="x") as run:
         sac = SAC(
@@ -85,7 +89,8 @@ def train(folder, *, kind="box", garbage=None, moving=False, whole=False, known=
     [
         pytest.param("discrete", {}, marks=pytest.mark.slow),
         pytest.param("box", {"moving": True}, marks=pytest.mark.slow),
-        ("box", {"whole": True}),
+        ("box", {"whole": True, "time_aware_critic": True}),
+        pytest.param("discrete", {"time_aware_critic": True}, marks=pytest.mark.slow),
         pytest.param("box", {"precision": "bf16"}, marks=pytest.mark.slow),
         pytest.param(
             *("box", {"entropy": "none", "normalise_observations": True}), marks=pytest.mark.slow
@@ -189,6 +194,50 @@ def test_episodes_that_are_held_back_are_stored_whole_once_they_end():
     ended = data["next", "done"].squeeze(-1)
     left = [160 - (int(row.nonzero()[-1]) + 1) for row in ended]
     assert data.numel() - sac.replay.written == sum(left)
+
+
+@pytest.mark.parametrize("whole", [False, True])
+def test_a_time_aware_critic_sees_the_discount_so_far(whole):
+    """Before each transition and after it; the demonstration's own time beside the agent's."""
+    env = GymVectorEnv(lambda: gymnasium.make("Pendulum-v1").unwrapped, 4, max_episode_steps=10)
+    cfg = replace(CFG, batch=400, random_steps=10_000, time_aware_critic=True, gamma=0.9)
+    known = transitions(20, dim=3)
+    known["elapsed"] = torch.full((20, 1), 0.75)
+    sac = SAC(
+        *(make_sac_agent(env, cfg, seed=0), cfg),
+        steps=STEPS,
+        demonstration=known,
+        relabel_episodes=(lambda episode: episode) if whole else None,
+    )
+    data = env.rollout(24, sac.act(), break_when_any_done=False)
+    data["observation"][..., 0] = torch.arange(24) % 10  # Tells the time.
+    data["next", "observation"][..., 0] = torch.arange(1, 25) % 10
+    for part in data.split(8, 1):
+        sac.update(part)
+    drawn = dict(zip(sac.keys, next(iter(sac._minibatches(1))), strict=True))
+    now, later = drawn["elapsed"], drawn["next", "elapsed"]
+    told = drawn["observation"][:, :1]
+    own = now != 0.75
+    torch.testing.assert_close(now[own], 0.9 ** told[own])
+    torch.testing.assert_close(later, now * 0.9)
+    assert 0 < (~own).sum() < 100 and len(now[own].unique()) == 10
+
+
+def test_the_time_changes_what_a_time_aware_critic_says_and_not_what_the_actor_does():
+    agent = SACAgent(3, Bounded(-1, 1, shape=(1,)), hidden=[8])
+    pair = transitions(5).rename_key_("action", "drawn_action")
+    critic, values = agent.critic(time_aware=True), []
+    for elapsed in (0.0, 1.0):
+        values.append(
+            critic(pair.set("elapsed", torch.full((5, 1), elapsed)))["state_action_value"]
+        )
+    assert not torch.isclose(*values).any()
+    assert agent.acting().in_keys == agent.actor_for_loss().in_keys == ["observation"]
+
+
+def test_the_demonstrations_time_begins_with_each_episode_and_counts_what_was_left_out():
+    transitions = TensorDict({"episode": torch.tensor([0, 0, 0, 1, 1, 1, 1])}, [7])
+    assert _steps(Demonstration(transitions)).flatten().tolist() == [0, 1, 2, 0, 1, 2, 3]
 
 
 def test_gradient_steps_are_as_many_as_asked(tmp_path):

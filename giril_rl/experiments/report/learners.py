@@ -7,7 +7,6 @@ from typing import Any
 
 from giril_rl.experiments.report.entries import PLAYER
 from giril_rl.experiments.report.rows import Panel, Row
-from giril_rl.experiments.report.settings import Changes
 from giril_rl.experiments.report.text import markdown, seeds_text, with_interval
 
 ALGORITHMS = ("ppo", "sac")
@@ -18,15 +17,15 @@ FEWEST = 2
 def twins(panel: Panel) -> dict[int, list[dict[str, Row]]]:
     """The rows that both algorithms have, by budget: for each method ``{algorithm: row}``.
 
-    Settings other than the algorithm's own are the same for both. Controls are left out, and
-    budgets at which fewer than two methods imitate with both.
+    Both have the same settings. Controls are left out, rows with other settings of an algorithm
+    itself, and budgets at which fewer than two methods imitate with both.
     """
     found: dict[int, dict[tuple[Any, ...], dict[str, Row]]] = {}
     for row in panel.rows:
-        if row.algorithm in ALGORITHMS and not row.is_control and row.method != PLAYER:
+        own = not any(key.startswith(("ppo.", "sac.")) for key, _ in row.changes)
+        if row.algorithm in ALGORITHMS and own and not row.is_control and row.method != PLAYER:
             kinds = found.setdefault(row.steps, {})
-            key = (row.method, row.profile, _changes(row))
-            kinds.setdefault(key, {}).setdefault(str(row.algorithm), row)
+            kinds.setdefault((row.method, row.profile, row.changes), {})[str(row.algorithm)] = row
     both = {
         steps: [pair for pair in kinds.values() if len(pair) == len(ALGORITHMS)]
         for steps, kinds in sorted(found.items())
@@ -36,11 +35,6 @@ def twins(panel: Panel) -> dict[int, list[dict[str, Row]]]:
         for steps, pairs in both.items()
         if len({row.method for pair in pairs for row in pair.values() if row.is_learned}) >= FEWEST
     }
-
-
-def _changes(row: Row) -> Changes:
-    """A row's changes without those of its algorithm."""
-    return tuple(change for change in row.changes if not change[0].startswith(f"{row.algorithm}."))
 
 
 def learner_and_reward(panel: Panel) -> str:
@@ -74,8 +68,8 @@ def _table(panel: Panel, steps: int, pairs: list[dict[str, Row]]) -> str:
 
 
 def _name(pair: Mapping[str, Row]) -> str:
-    changes = [f"{key}={value}" for key, value in _changes(pair["ppo"])]
-    return ", ".join([pair["ppo"].name_of_both, *changes])
+    row = pair["ppo"]
+    return f"{row.name_of_both}, {row.settings}" if row.settings else row.name_of_both
 
 
 def _titled(line: Mapping[str, str]) -> dict[str, str]:

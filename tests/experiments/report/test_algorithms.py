@@ -263,12 +263,13 @@ def test_learner_and_reward(made, capsys):
 
 
 def test_learner_and_reward_with_settings_that_differ_from_the_recipes_own(made):
-    """Each beside its own twin; settings of one algorithm have none in the other."""
-    for algorithm, own, pwil, giril in (
+    """Each beside its own twin, and none of a tuned algorithm."""
+    for algorithm, tuned, pwil, giril in (
         (PPO, "ppo.lr=0.002", -990.0, 20.0),
         (SAC, "sac.lr=0.002", 700.0, 30.0),
     ):
-        made("pwil", algorithm, own, score=pwil)
+        made("pwil", algorithm, score=pwil)
+        made("pwil", algorithm, tuned, score=999.0)
         made("giril", algorithm, PAPER, "demo.subsample=1", score=giril)
         made("giril", algorithm, PAPER, f"demo.subsample={3 if algorithm == SAC else 2}", score=0.0)
     made("bc", "demo.subsample=2", score=1.0)
