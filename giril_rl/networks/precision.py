@@ -51,12 +51,11 @@ def in_precision(network: nn.Sequential, precision: Precision) -> nn.Sequential:
     if precision not in get_args(Precision):
         raise UserError(f"precision={precision!r} is unknown: choose fp32 or bf16.")
     if precision == "bf16":
-        places = [index for index, part in enumerate(network) if isinstance(part, nn.Linear)]
-        for index in places[1:-1]:
-            layer = network[index]
-            sizes = layer.in_features, layer.out_features
+        linear = [(n, part) for n, part in enumerate(network) if isinstance(part, nn.Linear)]
+        for index, layer in linear[1:-1]:
+            sizes, has_bias = (layer.in_features, layer.out_features), layer.bias is not None
             # Without weights of its own, whose making would draw random numbers.
-            half = BFloat16Linear(*sizes, bias=layer.bias is not None, device="meta")
+            half = BFloat16Linear(*sizes, bias=has_bias, device="meta")
             half.load_state_dict(layer.state_dict(keep_vars=True), assign=True)
             network[index] = half
     return network

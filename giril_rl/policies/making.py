@@ -85,7 +85,7 @@ def make_sac_agent(
             hidden=cfg.hidden,
             normalise=cfg.normalise_observations,
             noise=cfg.noise if cfg.entropy == "none" else None,
-            precision=cfg.precision,  # type: ignore[arg-type]
+            precision=cfg.precision,
         )
 
 
