@@ -11,7 +11,7 @@ from pathlib import Path
 
 from torchrl.envs import Compose
 
-from giril_rl.config.schema import OffPolicyRunConfig, ScalingConfig
+from giril_rl.config.schema import OffPolicyRunConfig, SACConfig, ScalingConfig
 from giril_rl.demos import subsample
 from giril_rl.envs import make_env
 from giril_rl.rewards.pwil import PWILConfig, pwil_reward
@@ -31,6 +31,8 @@ class Config(OffPolicyRunConfig):
     """What `giril run pwil` takes."""
 
     scaling: ScalingConfig = field(default_factory=lambda: ScalingConfig(enabled=False))
+    # What a step is worth depends on what the episode visited before.
+    sac: SACConfig = field(default_factory=lambda: SACConfig(time_aware_critic=True))
     reward: PWILConfig = field(default_factory=PWILConfig)
 
 
