@@ -79,15 +79,17 @@ def changes_of(runs: Sequence[RunRecord]) -> dict[str, Changes]:
     """For each run's name, the settings that differ from its recipe's own for that task.
 
     Runs of a recipe that is not shipped are compared with the settings that most of them have. A
-    key that a run lacks, because it is older than the key, is no difference.
+    key that a run lacks, because it is older than the key, has the value that it behaved by, if
+    that is known, and is no difference otherwise.
     """
     usual = _usual(runs)
     found = {}
     for run in runs:
-        base = ADDED | (_defaults(run.recipe, run.task, run.env_id) or usual[run.recipe, run.task])
+        own = _defaults(run.recipe, run.task, run.env_id) or usual[run.recipe, run.task]
+        base = ADDED | own
         differing = {
             key: text_of(value)
-            for key, value in run.config.items()
+            for key, value in ({k: ADDED[k] for k in ADDED if k in own} | run.config).items()
             if key not in _IDENTITY
             and not (key in base and base[key] == value)
             and _reads(run, key)

@@ -160,6 +160,21 @@ def test_results_that_do_not_tell_their_algorithm_have_that_of_their_settings(ma
     assert all(not row.changes for row in panel(made).rows)
 
 
+def test_a_run_older_than_a_setting_has_the_value_that_it_behaved_by(made):
+    made("pwil", score=800.0)
+    folder = made("pwil", "seed=1", score=200.0)
+    rewrite(folder / "config.yaml", lambda config: config["sac"].pop("time_aware_critic"))
+    made("giril", SAC, score=1.0)
+    folder = made("giril", SAC, "seed=1", score=2.0)
+    rewrite(folder / "config.yaml", lambda config: config["sac"].pop("time_aware_critic"))
+    found = {(row.method, row.settings): row.scores for row in panel(made).rows}
+    assert found == {
+        ("giril", ""): [1.0, 2.0],
+        ("pwil", ""): [800.0],
+        ("pwil", "sac.time_aware_critic=false"): [200.0],
+    }
+
+
 def test_an_unfinished_run_tells_how_far_it_came(made, capsys):
     made("giril", score=1.0)
     made("pwil", "steps=1000")
