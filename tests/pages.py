@@ -168,7 +168,6 @@ OF = {
     "docs/quickstart.md": (runs, nothing),
     "docs/reproduce.md": (study_of("games.yaml"), nothing),
     "docs/results/pybullet.md": (runs, nothing),
-    "docs/results/pybullet-0.1.md": (runs, nothing),
     "docs/results/pybullet-sac.md": (runs, nothing),
     "docs/results/atari.md": (runs, nothing),
     "docs/results/no-survival.md": (runs, nothing),

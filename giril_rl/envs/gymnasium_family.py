@@ -42,6 +42,16 @@ def gym_factory(task: TaskConfig) -> Callable[[], gymnasium.Env]:
                     env.reset()
         except gymnasium.error.DependencyNotInstalled as error:
             raise UserError(f"{task.env_id} needs another package: {error}") from None
+        except ModuleNotFoundError as error:
+            raise UserError(
+                f"{task.env_id} needs the module {error.name}, which is not installed: install it, "
+                "or mend the entry point that the id is registered with."
+            ) from error
+        except Exception as error:
+            raise UserError(
+                f"{task.env_id} cannot be made ({type(error).__name__}: {error}): see that "
+                "gymnasium.make gives it without further arguments."
+            ) from error
         return env
 
     return make_one

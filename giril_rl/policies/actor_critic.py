@@ -35,6 +35,7 @@ class PPOAgent(Agent):
     normaliser: nn.Module
     discrete: bool
     one_hot: bool
+    action_size: int
     log_std: nn.Parameter | None
     bounds: ActionBounds | None
     drawn_key: str = "action"
@@ -182,7 +183,8 @@ class ActorCritic(PPOAgent):
         self.bounds = ActionBounds.of(action_spec)
         if self.bounds is not None:
             self.acting_keys, self.drawn_key = (*self.acting_keys, DRAWN), DRAWN
-        size = action_spec.space.n if self.discrete else action_spec.shape[-1]
+        size = int(action_spec.space.n if self.discrete else action_spec.shape[-1])
+        self.action_size = size
         self.normaliser = RunningNormaliser(observation_size) if normalise else nn.Identity()
         self.actor = orthogonal(mlp(observation_size, size, hidden), last=0.01)
         self.critic = orthogonal(mlp(observation_size, 1, hidden), last=1.0)

@@ -66,7 +66,8 @@ class PixelActorCritic(PPOAgent):
             )
         self.one_hot = isinstance(spec, OneHot)
         self.normaliser = nn.Identity()
-        self.actor = PixelActor(int(spec.space.n), channels)
+        self.action_size = int(spec.space.n)
+        self.actor = PixelActor(self.action_size, channels)
         self.critic = orthogonal(nn.Linear(512, 1), last=1.0)
 
     def hidden(self, observation: Tensor) -> Tensor:

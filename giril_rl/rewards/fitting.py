@@ -189,7 +189,7 @@ def fit(
         raise UserError(
             f"{count} transitions, steps={steps} and batch={batch}: give at least one of each."
         )
-    _check(loss, demonstration)
+    check_pairs(loss, demonstration)
     device = next(loss.parameters()).device
     data = demonstration.select(*loss.in_keys).reshape(-1).to(device)
     loss.reward.scaler.fit(data.get(loss.in_keys[0]))
@@ -209,8 +209,17 @@ def fit(
     return last
 
 
-def _check(loss: TransitionLoss, demonstration: TensorDictBase) -> None:
-    """Checks the whole demonstration once, so that minibatches need no checks of values."""
+def check_pairs(loss: TransitionLoss, demonstration: TensorDictBase) -> None:
+    """Checks the whole demonstration once, so that minibatches need no checks of values.
+
+    Args:
+        loss: of the reward that is to be fitted.
+        demonstration: its transitions.
+
+    Raises:
+        UserError: for entries that are missing, of another shape or dtype than the reward's, or
+            with values that are no action or no number.
+    """
     entries = read(demonstration, loss.in_keys)
     observation, action, *_ = filled = with_action(loss.reward, entries)
     scaler, actions = loss.reward.scaler, loss.reward.actions

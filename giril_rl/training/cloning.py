@@ -17,7 +17,7 @@ from giril_rl.moved import renamed_argument
 from giril_rl.networks.normalise import RunningNormaliser
 from giril_rl.policies import NORMALISED, PPOAgent
 from giril_rl.rewards.method import ORANGE, Method, register
-from giril_rl.rewards.transitions import PIXELS_AT_ONCE
+from giril_rl.rewards.transitions import PIXELS_AT_ONCE, read
 from giril_rl.runs.randomness import stream_seed
 from giril_rl.runs.run import Run
 from giril_rl.training.fitting import run_fit
@@ -69,7 +69,8 @@ def clone_behaviour(
         No environment steps, and the seconds, those of earlier processes included.
 
     Raises:
-        UserError: if ``cfg.stop="held_out"`` has no pairs to validate on.
+        UserError: if ``cfg.stop="held_out"`` has no pairs to validate on, or actions are not the
+            policy's.
         Interrupted: after a checkpoint, if the user asked for it with Ctrl-C.
         RunError: if a loss is no longer finite; the last checkpoint stays.
     """
@@ -79,8 +80,9 @@ def clone_behaviour(
             "bc.stop=held_out has no held-out transitions to look at: set demo.subsample to at "
             "least 2, or bc.stop=fixed."
         )
+    observation, _ = read(data, ["observation", "action"])
     if isinstance(agent.normaliser, RunningNormaliser):
-        agent.normaliser.fit(data.get("observation"), least=cfg.min_scale)
+        agent.normaliser.fit(observation, least=cfg.min_scale)
     cloning = _Cloning(agent, data, cfg, seed, validation, phase)
     seconds = run_fit(
         cloning,
@@ -190,14 +192,33 @@ def _loss(agent: PPOAgent) -> BCLoss:
 
 def _pairs(agent: PPOAgent, data: TensorDictBase) -> TensorDict:
     """Normalised observations and what the actor's output is fitted to."""
-    data = data.to(agent.device)
-    normalised = agent.normaliser(data.get("observation"))
-    action = data.get("action")
+    observation, action = (
+        entry.to(agent.device) for entry in read(data, ["observation", "action"])
+    )
+    action = _whole(agent, action, data.ndim)
     if agent.bounds is not None:
         action = agent.bounds.inverse(action)
-    elif agent.discrete and action.ndim > data.ndim:
+    return TensorDict({NORMALISED: agent.normaliser(observation), "action": action}, data.shape)
+
+
+def _whole(agent: PPOAgent, action: Tensor, batch_dims: int) -> Tensor:
+    """The demonstrated actions, discrete ones as integers, once they fit the policy's."""
+    size, event = agent.action_size, tuple(action.shape[batch_dims:])
+    needed = f"integers from 0 to {size - 1} of shape (n,), or one-hot vectors of shape (n, {size})"
+    if not agent.discrete:
+        fits, needed = event == (size,), f"vectors of shape (n, {size})"
+    elif event == (size,):
+        fits = bool(((action != 0).sum(-1) == 1).all())
         action = action.long().argmax(-1)
-    return TensorDict({NORMALISED: normalised, "action": action}, data.shape)
+    else:
+        fits = event == () and not action.is_floating_point()
+        fits = fits and bool(((action >= 0) & (action < size)).all())
+    if not fits:
+        raise UserError(
+            f"actions are {action.dtype} of shape {tuple(action.shape)}, and the policy's are "
+            f"{needed}: give those, or a policy of these actions."
+        )
+    return action
 
 
 def _mean_loss(loss: BCLoss, pairs: TensorDict) -> float:

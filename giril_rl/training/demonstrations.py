@@ -51,9 +51,13 @@ def open_run(cfg: RunConfig, out: Path, *, recipe: str) -> Run:
     """
     if isinstance(cfg, DemoRunConfig) and cfg.needs_demonstration:
         check_inputs(cfg)
-    else:
-        check_task(cfg)
-    return Run.open(out, asdict(cfg), recipe=recipe, logger=cfg.logger)
+        # How long it will take is said once the demonstration is looked for.
+        return Run.open(out, asdict(cfg), recipe=recipe, logger=cfg.logger)
+    check_task(cfg)
+    run = Run.open(out, asdict(cfg), recipe=recipe, logger=cfg.logger)
+    if not run.finished:
+        announce(cfg, ExpertConfig(), DemoConfig(), has_player=True)
+    return run
 
 
 def check_inputs(

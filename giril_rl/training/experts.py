@@ -13,7 +13,7 @@ from filelock import FileLock, Timeout
 from torchrl.envs import Compose, SignTransform
 
 from giril_rl.config.imports import import_modules, modules_of
-from giril_rl.config.schema import ExpertConfig, ExpertRunConfig, RunConfig
+from giril_rl.config.schema import DemoConfig, ExpertConfig, ExpertRunConfig, RunConfig
 from giril_rl.config.tasks import apply_task_defaults
 from giril_rl.envs import gym_factory, make_env, with_own_episodes
 from giril_rl.envs.families import spaces_of
@@ -26,6 +26,7 @@ from giril_rl.runs.machine import check_device
 from giril_rl.runs.run import Run
 from giril_rl.training.algorithm import make_algorithm
 from giril_rl.training.loop import train_policy
+from giril_rl.training.outlook import announce
 from giril_rl.training.ppo import return_scaling
 from giril_rl.training.result import finish_run
 
@@ -45,13 +46,16 @@ def check_task(cfg: RunConfig) -> None:
         check_squashable(spaces_of(cfg.task)[1])
 
 
-def train_expert(cfg: ExpertRunConfig, folder: Path, *, recipe: str = "expert") -> dict[str, Any]:
+def train_expert(
+    cfg: ExpertRunConfig, folder: Path, *, recipe: str = "expert", announced: bool = False
+) -> dict[str, Any]:
     """Trains PPO on the true reward and scores it, or returns what an earlier run left.
 
     Args:
         cfg: the expert's settings.
         folder: the run's folder.
         recipe: the recipe's name.
+        announced: whether it was said already how long it may take.
 
     Returns:
         The contents of ``result.json``.
@@ -63,6 +67,8 @@ def train_expert(cfg: ExpertRunConfig, folder: Path, *, recipe: str = "expert") 
     with Run.open(folder, asdict(cfg), recipe=recipe, logger=cfg.logger) as run:
         if run.finished:
             return read_result(folder)
+        if not announced:
+            announce(cfg, ExpertConfig(), DemoConfig(), has_player=True)
         env = run.closing(make_env(cfg.task, cfg.learner.num_envs, cfg.seed, use="player"))
         learner = make_algorithm(env, cfg, run=run, use="player")
         trained = train_policy(
@@ -105,7 +111,7 @@ def obtain_expert(cfg: RunConfig, expert: ExpertConfig) -> tuple[Path, dict[str,
     settings = expert_settings(cfg, expert)
     folder = out_folder("expert", settings, {})
     with made_once(folder, "expert"):
-        return folder, train_expert(settings, folder)
+        return folder, train_expert(settings, folder, announced=True)
 
 
 def expert_settings(cfg: RunConfig, expert: ExpertConfig) -> ExpertRunConfig:

@@ -12,6 +12,7 @@ from torchrl.objectives import LossModule
 from giril_rl.config.schema import FitConfig
 from giril_rl.graphs.gradients import TracedGradients
 from giril_rl.moved import renamed_argument
+from giril_rl.rewards.fitting import TransitionLoss, check_pairs
 from giril_rl.rewards.transitions import PIXELS_AT_ONCE
 from giril_rl.runs.checkpoint import refusing_misfits
 from giril_rl.runs.finite_checks import Finite
@@ -134,9 +135,12 @@ def fit_reward(
         Seconds of fitting, those of earlier processes included; ``run.fit_seconds`` counts them.
 
     Raises:
+        UserError: for transitions that do not fit the reward.
         Interrupted: after a checkpoint, if the user asked for it with Ctrl-C.
         RunError: if a loss is no longer finite; the last checkpoint stays.
     """
+    if isinstance(loss, TransitionLoss):
+        check_pairs(loss, data)
     fit = _RewardFit(loss, data, cfg, seed, validation)
     seconds = run_fit(
         fit,

@@ -14,6 +14,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from giril_rl.config.schema import TaskConfig
 from giril_rl.envs import BatchedEnv, for_scores, make_env
+from giril_rl.errors import UserError
 from giril_rl.policies import check_actions
 from giril_rl.runs.progress import progress
 from giril_rl.runs.randomness import Use, seeded, stream_seed
@@ -82,7 +83,8 @@ def evaluate(
         The scores; the standard deviation is the sample's (n - 1), 0 for one episode.
 
     Raises:
-        UserError: if the agent was made for other actions than the task's.
+        UserError: if the agent was made for other actions than the task's, or a return is not
+            finite.
 
     Examples:
         >>> from giril_rl.policies import ActorCritic
@@ -116,6 +118,13 @@ def evaluate(
     returns = torch.cat([part.returns for part in played])
     lengths = torch.cat([part.lengths for part in played])
     lives = sum(part.lives for part in played)
+    if not returns.isfinite().all():
+        number = int((~returns.isfinite()).nonzero()[0])
+        raise UserError(
+            f"the true return of evaluation episode {number} is {returns[number].item()}: the "
+            f"environment {task.env_id} pays a reward that is no number; mend it, and make the run "
+            "anew."
+        )
     return Scores(
         return_mean=returns.mean().item(),
         return_std=returns.std().item() if episodes > 1 else 0.0,

@@ -84,6 +84,30 @@ def test_missing_packages_are_named(monkeypatch):
     assert "CartPole-v1 needs another package: Box2D" in refused("CartPole-v1")
 
 
+@pytest.mark.parametrize(
+    ("entry", "told"),
+    [
+        ("no_such_module:Env", "needs the module no_such_module, which is not installed"),
+        ("tests_of_families:NoSuchClass", r"cannot be made \(AttributeError: "),
+        ("tests_of_families:Broken", r"cannot be made \(ValueError: out of order\)"),
+        ("tests_of_families:Wants", r"cannot be made \(TypeError: "),
+    ],
+)
+def test_what_cannot_be_made_is_told_in_a_sentence(entry, told, tmp_path, monkeypatch):
+    (tmp_path / "tests_of_families.py").write_text(
+        "import gymnasium\n"
+        "class Broken(gymnasium.Env):\n"
+        "    def __init__(self): raise ValueError('out of order')\n"
+        "class Wants(gymnasium.Env):\n"
+        "    def __init__(self, size): pass\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    name = f"Unmakeable{abs(hash(entry))}-v0"
+    gymnasium.register(name, entry, max_episode_steps=5)
+    with pytest.raises(UserError, match=told):
+        make_env(TaskConfig(name="unmakeable", env_id=name), 1, seed=0)
+
+
 BOXES = '''
 import gymnasium
 import numpy as np

@@ -287,3 +287,27 @@ def test_a_finished_cloning_is_only_loaded(stop, tmp_path):
     assert same(agent, again)
     assert rows == same_rows
     assert (tmp_path / "bc.safetensors").stat().st_mtime_ns == before
+
+
+@pytest.mark.parametrize(
+    ("spec", "actions"),
+    [
+        (DISCRETE, torch.ones(40, 1, dtype=torch.int64)),
+        (DISCRETE, torch.ones(40)),
+        (DISCRETE, torch.full((40,), 3)),
+        (DISCRETE, torch.ones(40, 3, dtype=torch.int64)),
+        (BOX, torch.zeros(40)),
+        (BOX, torch.zeros(40, 1)),
+    ],
+    ids=["column", "floats", "outside", "not one-hot", "no width", "another width"],
+)
+def test_actions_that_the_policy_cannot_play_are_refused(spec, actions, tmp_path):
+    data = pairs(40, spec=spec).set("action", actions)
+    with pytest.raises(UserError, match=r"actions are torch.* and the policy's are"):
+        cloned(tmp_path, data, spec=spec, stop="fixed")
+
+
+@pytest.mark.parametrize("missing", ["observation", "action"])
+def test_pairs_that_lack_an_entry_are_refused(missing, tmp_path):
+    with pytest.raises(UserError, match=f"the batch has no '{missing}'"):
+        cloned(tmp_path, pairs(40).exclude(missing), stop="fixed")

@@ -8,6 +8,7 @@ import torch
 
 from giril_rl.config.schema import TaskConfig
 from giril_rl.envs import make_env
+from giril_rl.errors import UserError
 from giril_rl.policies.actor_critic import ActorCritic
 from giril_rl.runs.randomness import stream_seed
 from giril_rl.training.scoring import EPISODES_AT_ONCE, evaluate, evaluate_both
@@ -192,3 +193,27 @@ def test_simulators_are_closed(monkeypatch):
     monkeypatch.setattr(CartPoleEnv, "close", lambda self: closed.append(self))
     evaluate(make_agent(CARTPOLE), CARTPOLE, episodes=5, seed=0, deterministic=True)
     assert len(closed) >= 5
+
+
+class _NoNumber(gymnasium.Env):
+    """Its third step pays NaN."""
+
+    observation_space = gymnasium.spaces.Box(-1, 1, (2,), np.float32)
+    action_space = gymnasium.spaces.Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.steps = 0
+        return np.zeros(2, np.float32), {}
+
+    def step(self, action):
+        self.steps += 1
+        reward = float("nan") if self.steps == 3 else 1.0
+        return np.zeros(2, np.float32), reward, False, False, {}
+
+
+def test_a_return_that_is_no_number_is_no_score():
+    gymnasium.register("NoNumber-v0", _NoNumber, max_episode_steps=5)
+    task = TaskConfig(name="no_number", env_id="NoNumber-v0")
+    with pytest.raises(UserError, match="episode 0 is nan: the environment NoNumber-v0 pays"):
+        evaluate(make_agent(task), task, episodes=2, seed=0, deterministic=True)

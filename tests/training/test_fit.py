@@ -6,6 +6,7 @@ from torch import nn
 from torchrl.data import Bounded, Categorical
 
 from giril_rl.config.schema import FitConfig
+from giril_rl.errors import UserError
 from giril_rl.rewards import (
     CuriosityReward,
     CuriosityRewardLoss,
@@ -219,3 +220,11 @@ def test_a_fit_of_frames_is_resumed_bit_for_bit_with_its_statistics(compile, tmp
     for name, value in expected.items():
         assert torch.equal(found[name], value), name
     assert found_rows == expected_rows
+
+
+def test_transitions_that_do_not_fit_the_reward_are_refused(tmp_path):
+    with pytest.raises(UserError, match="the batch has no 'action'"):
+        fitted(tmp_path, data=transitions(20).exclude("action"))
+    wrong = transitions(20, kind="discrete").set("action", torch.full((20,), 3))
+    with pytest.raises(UserError, match=r"the demonstration's action at index \[0\] is 3"):
+        fitted(tmp_path, kind="discrete", data=wrong)

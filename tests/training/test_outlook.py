@@ -1,6 +1,17 @@
 """What a run says of its length before it begins."""
 
-from giril_rl.config.schema import DemoConfig, ExpertConfig, FitConfig, RunConfig, TaskConfig
+import pytest
+
+from giril_rl.config.schema import (
+    DemoConfig,
+    ExpertConfig,
+    ExpertRunConfig,
+    FitConfig,
+    RunConfig,
+    TaskConfig,
+)
+from giril_rl.methods import ControlRunConfig
+from giril_rl.training import open_run, train_expert
 from giril_rl.training.outlook import announce, outlook
 
 BREAKOUT = TaskConfig(name="breakout", env_id="ALE/Breakout-v5", expert_steps=9_000_000)
@@ -28,3 +39,22 @@ def test_what_is_short_begins_without_a_word(capsys):
     assert "player: at most 180,000 steps, about 30 s; policy: 720,000 steps, about 2 min" in (
         capsys.readouterr().err
     )
+
+
+def test_runs_that_learn_from_nobody_tell_it_too(tmp_path, capsys, monkeypatch):
+    """An expert, and a control without a demonstration, before anything is made."""
+
+    class Began(Exception):
+        pass
+
+    def begin(*_, **__):
+        raise Began
+
+    monkeypatch.setattr("giril_rl.training.experts.make_env", begin)
+    cfg = ExpertRunConfig(task=POLE, steps=720_000)
+    with pytest.raises(Began):
+        train_expert(cfg, tmp_path / "expert")
+    assert "policy: 720,000 steps, about 2 min" in capsys.readouterr().err
+    cfg = ControlRunConfig(task=POLE, steps=720_000, reward="constant")
+    with open_run(cfg, tmp_path / "control", recipe="control"):
+        assert "policy: 720,000 steps, about 2 min" in capsys.readouterr().err
