@@ -139,7 +139,8 @@ def fit_reward(
         Interrupted: after a checkpoint, if the user asked for it with Ctrl-C.
         RunError: if a loss is no longer finite; the last checkpoint stays.
     """
-    if isinstance(loss, TransitionLoss):
+    # Some losses read more than transitions, such as which member of an ensemble sees them.
+    if isinstance(loss, TransitionLoss) and loss.in_keys == loss.reward.in_keys:
         check_pairs(loss, data)
     fit = _RewardFit(loss, data, cfg, seed, validation)
     seconds = run_fit(

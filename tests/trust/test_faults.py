@@ -213,7 +213,7 @@ def test_fits_that_leave_the_numbers(tmp_path):
     bad["next", "observation"][7, 3] = float("nan")
     with (
         Run.open(tmp_path / "bad", {}, recipe="x") as run,
-        pytest.raises(RunError, match=r"next observation is nan at \[7, 3\] of the batch, so that"),
+        pytest.raises(UserError, match=r"'observation'\) is nan at index \[7, 3\]: leave that"),
     ):
         fit_reward(GenerativeRewardLoss(reward_of(env)), bad, FitConfig(steps=20), seed=0, run=run)
     with (
