@@ -18,7 +18,7 @@ from torch import nn
 from giril_rl.config.schema import BCConfig, FitConfig, PPOConfig, TaskConfig
 from giril_rl.demos import record_demonstration
 from giril_rl.envs import GymVectorEnv, gym_factory, make_env
-from giril_rl.errors import FAILED, RunError
+from giril_rl.errors import FAILED, RunError, UserError
 from giril_rl.rewards import GenerativeReward, GenerativeRewardLoss
 from giril_rl.runs.checkpoint import load_state
 from giril_rl.training import PPO, Run, clone_behaviour, fit_reward, make_agent, train_policy
