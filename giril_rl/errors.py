@@ -36,6 +36,16 @@ class UserError(Exception):
     """
 
 
+def first_line(error: Exception) -> str:
+    r"""The first line of an error's message, without a full stop.
+
+    Examples:
+        >>> first_line(ValueError("out of order.\nSee the manual."))
+        'out of order'
+    """
+    return (str(error).strip().splitlines() or [type(error).__name__])[0].rstrip(".")
+
+
 class RunError(Exception):
     """Why a run could not go on, in one sentence that says what happened and what to do.
 

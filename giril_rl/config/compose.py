@@ -23,11 +23,11 @@ from omegaconf.errors import OmegaConfBaseException
 from giril_rl.config.families import GYMNASIUM, family_of
 from giril_rl.config.knobs import default_text, flat
 from giril_rl.config.overrides import KeyCheck, normalised, parse, words_by_key
-from giril_rl.config.recipes import Recipe, first_line, load_yaml, shipped_conf
+from giril_rl.config.recipes import Recipe, load_yaml, shipped_conf
 from giril_rl.config.schema import RunConfig, idle_algorithm
 from giril_rl.config.tasks import apply_task_defaults
 from giril_rl.config.validation import validate
-from giril_rl.errors import UserError
+from giril_rl.errors import UserError, first_line
 from giril_rl.files.untrusted import check_references
 
 SCHEMA = "recipe_schema"

@@ -28,7 +28,7 @@ from omegaconf.errors import OmegaConfBaseException
 from giril_rl.config.imports import missing, search_in
 from giril_rl.config.nearest import did_you_mean
 from giril_rl.config.schema import RunConfig
-from giril_rl.errors import UserError
+from giril_rl.errors import UserError, first_line
 from giril_rl.files.untrusted import check_yaml, read_text
 
 
@@ -327,8 +327,3 @@ def load_yaml(path: Path) -> Any:
         raise UserError(f"{path} is not valid YAML{line}: {problem}; correct it.") from error
     except (OSError, ValueError, OmegaConfBaseException) as error:
         raise UserError(f"{path} cannot be read as YAML: {first_line(error)}.") from error
-
-
-def first_line(error: Exception) -> str:
-    """The first line of an error's message, without a full stop."""
-    return (str(error).strip().splitlines() or [type(error).__name__])[0].rstrip(".")

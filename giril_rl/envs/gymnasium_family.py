@@ -13,7 +13,7 @@ from giril_rl.envs.batched import BatchedEnv
 from giril_rl.envs.fixed import AfterFailure, FixedHorizonEnv
 from giril_rl.envs.gym_api import import_package, registered_spec, silent_stdout
 from giril_rl.envs.vector import GymImageEnv, GymVectorEnv
-from giril_rl.errors import UserError
+from giril_rl.errors import UserError, first_line
 from giril_rl.runs.randomness import Use
 
 BULLET = "BulletEnv"
@@ -49,8 +49,8 @@ def gym_factory(task: TaskConfig) -> Callable[[], gymnasium.Env]:
             ) from error
         except Exception as error:
             raise UserError(
-                f"{task.env_id} cannot be made ({type(error).__name__}: {error}): see that "
-                "gymnasium.make gives it without further arguments."
+                f"{task.env_id} cannot be made ({type(error).__name__}: {first_line(error)}): see "
+                "that gymnasium.make gives it without further arguments."
             ) from error
         return env
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch._dynamo.exc import TorchDynamoException
 
-from giril_rl.errors import RunError
+from giril_rl.errors import RunError, first_line
 
 
 def compiled(
@@ -63,11 +63,10 @@ def _compiling() -> Iterator[None]:
     try:
         yield
     except TorchDynamoException as error:
-        reason = str(error).strip().partition("\n")[0]
         raise RunError(
-            f"torch could not compile the gradient steps ({reason}; --traceback shows all): give "
-            "the same command without compile=true, or see whether a C++ compiler is installed, "
-            "and for a GPU Triton; what was saved before is as it was."
+            f"torch could not compile the gradient steps ({first_line(error)}; --traceback shows "
+            "all): give the same command without compile=true, or see whether a C++ compiler is "
+            "installed, and for a GPU Triton; what was saved before is as it was."
         ) from error
     finally:
         if masks:

@@ -14,6 +14,7 @@ from torch import Tensor, fx, nn
 from torch.fx.experimental.proxy_tensor import make_fx
 from torch.nn.modules.conv import _ConvNd
 
+from giril_rl.errors import first_line
 from giril_rl.graphs.compiling import compiled
 from giril_rl.runs.randomness import restore_rng, rng_state
 
@@ -238,7 +239,7 @@ def _graph(function: Function, inputs: Sequence[Tensor]) -> fx.GraphModule:
     except CannotRecord:
         raise
     except Exception as error:
-        reason = str(error).strip().partition("\n")[0]
+        reason = first_line(error)
         if "_local_scalar_dense" in reason:
             reason = "Python looks at the value of a tensor"
         raise CannotRecord(reason) from error

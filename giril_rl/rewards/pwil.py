@@ -227,7 +227,8 @@ class PWILReward(TrajectoryReward):
         # The squared distance less |x|^2, which is the same for all atoms.
         near = torch.addmm(self.atoms.squares, x.flatten(0, 1), points.T, alpha=-2)
         before = (self.full * len(points) - self.left.sum(1)) // self.each
-        paid = self.horizon > steps_before(ends, before).T
+        played = steps_before(ends, before).T
+        paid = played < self.horizon
         step, atom, taken, self.left = greedy_coupling(
             near.view(*x.shape[:2], -1), self.left, paid * self.each, over, self.full
         )

@@ -36,7 +36,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors import torch as safetensors_torch
 from torch import Tensor
 
-from giril_rl.errors import UserError
+from giril_rl.errors import UserError, first_line
 from giril_rl.files.disk import write_atomically
 from giril_rl.files.untrusted import check_format, parse_json
 
@@ -70,7 +70,7 @@ def refusing_misfits(run: Run, phase: str) -> Iterator[None]:
     except torch.OutOfMemoryError:
         raise  # A RuntimeError, but no reason to delete the checkpoint.
     except (KeyError, IndexError, AttributeError, TypeError, ValueError, RuntimeError) as error:
-        reason = str(error).strip().partition("\n")[0]
+        reason = first_line(error)
         raise UserError(
             f"{run.folder / phase}.safetensors cannot be restored ({type(error).__name__}: "
             f"{reason}): if it is a checkpoint of another run or task, delete the file to start "

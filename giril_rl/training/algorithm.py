@@ -16,7 +16,7 @@ from giril_rl.errors import UserError
 from giril_rl.policies.agent import Agent
 from giril_rl.policies.making import make_agent, make_sac_agent
 from giril_rl.policies.soft_actor_critic import ELAPSED
-from giril_rl.rewards.trajectory import fresh_episodes, steps_before, trajectory_rewards
+from giril_rl.rewards.trajectory import fresh_episodes, trajectory_rewards
 from giril_rl.runs.randomness import Use
 from giril_rl.runs.run import Run
 from giril_rl.training.ppo import PPO, return_scaling
@@ -113,8 +113,6 @@ def make_algorithm(
     known = None
     if demo is not None and cfg.sac.demonstration != "none":
         known = _demonstrated(demo, cfg, transform, moving, demonstration_reward)
-        if cfg.sac.time_aware_critic:
-            known.set(ELAPSED, cfg.sac.gamma ** _steps(demo)[:: _every(cfg)].float())
     settings = getattr(cfg, "scaling", None)
     scaling = return_scaling(settings, cfg.sac.gamma) if settings is not None else []
     return SAC(
@@ -182,14 +180,14 @@ def _demonstrated(
     elif transform is not None and not moving:
         with fresh_episodes(transform):
             known = transform(known.unsqueeze(0).to(cfg.device)).squeeze(0)
+    if cfg.sac.time_aware_critic:
+        known.set(ELAPSED, cfg.sac.gamma ** _steps(demo).float())
     return subsample(Demonstration(known.cpu()), _every(cfg))
 
 
 def _steps(demo: Demonstration) -> Tensor:
     """Each transition's place ``(n, 1)`` in its episode."""
-    episode = demo.transitions["episode"].reshape(1, -1)
-    ends = episode.diff(append=episode[:, -1:]) != 0
-    return steps_before(ends, torch.zeros(1, dtype=torch.int64)).reshape(-1, 1)
+    return torch.cat([torch.arange(length) for length in demo.lengths.tolist()]).unsqueeze(-1)
 
 
 def pairs_of(cfg: RunConfig, demo: Demonstration) -> int:

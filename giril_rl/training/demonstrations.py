@@ -56,7 +56,7 @@ def open_run(cfg: RunConfig, out: Path, *, recipe: str) -> Run:
     check_task(cfg)
     run = Run.open(out, asdict(cfg), recipe=recipe, logger=cfg.logger)
     if not run.finished:
-        announce(cfg, ExpertConfig(), DemoConfig(), has_player=True)
+        announce(cfg)
     return run
 
 

@@ -114,7 +114,7 @@ class EpisodeClock:
         """The steps ``(num_envs, time)`` before each one of its episode."""
         done = batch.get(("next", "done")).squeeze(-1)
         if not len(self._before):
-            self._before = torch.zeros(len(done), dtype=torch.int64)
+            self._before = torch.zeros(len(done), dtype=torch.int64, device=done.device)
         moved = self._continuity.moved(batch)
         steps = steps_before(done, self._before.masked_fill(moved, 0))
         self._before = (steps[:, -1] + 1).masked_fill(done[:, -1], 0)

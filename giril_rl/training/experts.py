@@ -13,7 +13,7 @@ from filelock import FileLock, Timeout
 from torchrl.envs import Compose, SignTransform
 
 from giril_rl.config.imports import import_modules, modules_of
-from giril_rl.config.schema import DemoConfig, ExpertConfig, ExpertRunConfig, RunConfig
+from giril_rl.config.schema import ExpertConfig, ExpertRunConfig, RunConfig
 from giril_rl.config.tasks import apply_task_defaults
 from giril_rl.envs import gym_factory, make_env, with_own_episodes
 from giril_rl.envs.families import spaces_of
@@ -68,7 +68,7 @@ def train_expert(
         if run.finished:
             return read_result(folder)
         if not announced:
-            announce(cfg, ExpertConfig(), DemoConfig(), has_player=True)
+            announce(cfg)
         env = run.closing(make_env(cfg.task, cfg.learner.num_envs, cfg.seed, use="player"))
         learner = make_algorithm(env, cfg, run=run, use="player")
         trained = train_policy(

@@ -16,14 +16,18 @@ SAC_UPDATES_PER_SECOND = 300
 
 
 def outlook(
-    cfg: RunConfig, expert: ExpertConfig, demo: DemoConfig, *, has_player: bool
+    cfg: RunConfig,
+    expert: ExpertConfig | None = None,
+    demo: DemoConfig | None = None,
+    *,
+    has_player: bool = False,
 ) -> dict[str, float]:
     """The parts of a run, each with about how many seconds it takes on one core.
 
     Args:
         cfg: the recipe's settings.
-        expert: its expert's.
-        demo: its demonstration's.
+        expert: its expert's; None where it learns from nobody.
+        demo: its demonstration's; None for the same.
         has_player: whether the player is there already.
 
     Examples:
@@ -34,7 +38,7 @@ def outlook(
     """
     rates = STEPS_PER_SECOND[cfg.task.family.observation]
     parts = {}
-    if demo.path is None and expert.path is None and not has_player:
+    if expert and demo and demo.path is None and expert.path is None and not has_player:
         most = expert.steps_on(cfg.task)
         parts[f"player: at most {most:,} steps"] = most / rates["player"]
     fit = getattr(cfg, "fit", None)
@@ -48,7 +52,13 @@ def outlook(
     return parts
 
 
-def announce(cfg: RunConfig, expert: ExpertConfig, demo: DemoConfig, *, has_player: bool) -> None:
+def announce(
+    cfg: RunConfig,
+    expert: ExpertConfig | None = None,
+    demo: DemoConfig | None = None,
+    *,
+    has_player: bool = False,
+) -> None:
     """Prints :func:`outlook` to the terminal, where a part takes 90 seconds or more."""
     parts = outlook(cfg, expert, demo, has_player=has_player)
     if max(parts.values(), default=0) >= 90:

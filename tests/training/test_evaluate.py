@@ -195,25 +195,16 @@ def test_simulators_are_closed(monkeypatch):
     assert len(closed) >= 5
 
 
-class _NoNumber(gymnasium.Env):
+class NoNumber(StepCounter):
     """Its third step pays NaN."""
 
-    observation_space = gymnasium.spaces.Box(-1, 1, (2,), np.float32)
-    action_space = gymnasium.spaces.Discrete(2)
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.steps = 0
-        return np.zeros(2, np.float32), {}
-
     def step(self, action):
-        self.steps += 1
-        reward = float("nan") if self.steps == 3 else 1.0
-        return np.zeros(2, np.float32), reward, False, False, {}
+        observation, reward, *flags = super().step(action)
+        return observation, float("nan") if observation[1] == 3 else reward, *flags
 
 
 def test_a_return_that_is_no_number_is_no_score():
-    gymnasium.register("NoNumber-v0", _NoNumber, max_episode_steps=5)
+    gymnasium.register("NoNumber-v0", NoNumber, kwargs={"length": 5}, max_episode_steps=9)
     task = TaskConfig(name="no_number", env_id="NoNumber-v0")
     with pytest.raises(UserError, match="episode 0 is nan: the environment NoNumber-v0 pays"):
         evaluate(make_agent(task), task, episodes=2, seed=0, deterministic=True)
